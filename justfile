@@ -29,7 +29,7 @@ test *arguments:
 
 # kernels as plain Python: real tracebacks, real coverage
 test-plain:
-    NUMBA_DISABLE_JIT=1 .venv/bin/pytest -n auto -m "kernels and not slow"
+    NUMBA_DISABLE_JIT=1 .venv/bin/pytest -n auto -m "kernels and not compiled and not slow"
 
 # damaged files of every format, 100 000 by default; arguments go to the harness
 hostile *arguments="--cases 100000":

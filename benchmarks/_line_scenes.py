@@ -137,6 +137,15 @@ SCENES: dict[str, Callable[[Path], LineScene]] = {
     "boxes-held-many": lambda data: boxes(
         "boxes-held-many", BoxSettings(seed=404, num_images=48, texture=10.0, width=640, height=480, focal=560.0)
     ),
+    # Rendered on 23 November 2026, when nothing was changed any more.
+    "boxes-new-tex10": lambda data: boxes("boxes-new-tex10", BoxSettings(seed=1301, texture=10.0)),
+    "boxes-new-tex20": lambda data: boxes("boxes-new-tex20", BoxSettings(seed=1302, texture=20.0)),
+    "boxes-new-tex10-small": lambda data: boxes(
+        "boxes-new-tex10-small", BoxSettings(seed=1303, texture=10.0, width=640, height=480, focal=560.0)
+    ),
+    "boxes-new-tex20-small": lambda data: boxes(
+        "boxes-new-tex20-small", BoxSettings(seed=1304, texture=20.0, width=640, height=480, focal=560.0)
+    ),
     "boxes-round": lambda data: boxes(
         "boxes-round", BoxSettings(seed=621, num_boxes=5, num_round=9, num_images=36, texture=6.0)
     ),

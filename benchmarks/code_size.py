@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The size and form of the sources as one table of counts, read from the syntax and not run.
 
-    python benchmarks/code_size.py [--root DIR] [--list ROW]
+    python benchmarks/code_size.py [--since COMMIT] [--root DIR] [--list ROW] [--rooms]
 
-Compares two states of the house: run it on both checkouts. ``--list`` prints what a row counts.
+``--since`` shows a commit of this checkout beside it (the state before the house was rebuilt is 961f0a1), ``--root``
+counts another checkout, ``--list`` prints what a row counts, ``--rooms`` the source lines of every room.
 
 ==========================  ==========================================================================================
 Row                         Rule
 ==========================  ==========================================================================================
 lines, source lines         all lines of ``src/groma/**/*.py``; those that are neither blank, comment nor docstring
+largest room, longest ...   files of a room; lines of a module, and of a function (commands: of its body)
+repeated lines              source lines, imports and lone brackets left out, in runs of six or more that stand in the
+                            sources twice to the letter
 long functions              more than 60 lines from ``def`` to the end, without the docstring
 many arguments              ten or more arguments, ``self`` and ``cls`` not counted; in rows of their own kernels
                             (``@kernel``, ``@loop``, ...) and the command line, whose arguments are its options
@@ -16,7 +20,7 @@ private imports             imports of an underscored name or module by another 
 optimiser loops             functions with a loop in which a name that contains ``damp`` or ``lambda`` is assigned to:
                             every damped least-squares loop raises and lowers its damping
 numbers                     named, defaults, floats in functions, integers in comparisons, gates with origin: by the
-                            rules of ``tuned_numbers.py``
+                            rules of ``tuned_numbers.py``; the four kinds without an origin summed up in a row
 public names                ``groma.__all__``; and functions and classes without underscore in modules without one
 ==========================  ==========================================================================================
 """
@@ -25,6 +29,10 @@ from __future__ import annotations
 
 import argparse
 import ast
+import io
+import subprocess
+import tarfile
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -35,7 +43,7 @@ import tuned_numbers
 
 Found: TypeAlias = list[str]
 Function: TypeAlias = ast.FunctionDef | ast.AsyncFunctionDef
-LONG, MANY = 60, 10
+LONG, MANY, RUN = 60, 10, 6
 #: Decorators of compiled code.
 KERNELS = {"exact_kernel", "inline_kernel", "intrinsic", "kernel", "loop"}
 
@@ -61,6 +69,11 @@ def modules_of(root: Path) -> list[Module]:
     return found
 
 
+def room_of(module: Module) -> str:
+    """Return the package that a module is in."""
+    return module.name if module.is_package else module.name.rpartition(".")[0]
+
+
 def docstring_lines(node: ast.AST) -> set[int]:
     """Return the lines of the docstring of a module, class or function."""
     body = getattr(node, "body", [])
@@ -70,16 +83,34 @@ def docstring_lines(node: ast.AST) -> set[int]:
     return set()
 
 
-def source_lines(module: Module) -> int:
-    """Count the lines that are neither blank, comment nor docstring."""
-    documented: set[int] = set()
+def source_lines(module: Module, imports: bool = True) -> list[str]:
+    """Return the lines that are neither blank, comment nor docstring."""
+    left_out: set[int] = set()
     for node in ast.walk(module.tree):
         if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
-            documented |= docstring_lines(node)
-    return sum(
-        bool(line.strip()) and not line.strip().startswith("#") and number not in documented
-        for number, line in enumerate(module.text.splitlines(), 1)
-    )
+            left_out |= docstring_lines(node)
+        elif isinstance(node, (ast.Import, ast.ImportFrom)) and not imports:
+            left_out |= set(range(node.lineno, (node.end_lineno or 0) + 1))
+    lines = enumerate(map(str.strip, module.text.splitlines()), 1)
+    return [line for number, line in lines if line and not line.startswith("#") and number not in left_out]
+
+
+def repeated_lines(modules: list[Module]) -> int:
+    """Count the lines in runs that stand in the sources twice, but for the first time."""
+    known: set[tuple[str, ...]] = set()
+    count = 0
+    for module in modules:
+        lines = [line for line in source_lines(module, imports=False) if any(map(str.isalnum, line))]
+        runs = [tuple(lines[k : k + RUN]) for k in range(len(lines) - RUN + 1)]
+        repeated: set[int] = set()
+        for k, run in enumerate(runs):
+            if k >= RUN:  # runs that overlap are not two
+                known.add(runs[k - RUN])
+            if run in known:
+                repeated.update(range(k, k + RUN))
+        known.update(runs)
+        count += len(repeated)
+    return count
 
 
 def functions(module: Module) -> Iterator[tuple[str, Function]]:
@@ -94,6 +125,18 @@ def functions(module: Module) -> Iterator[tuple[str, Function]]:
             yield from inside(child, name)
 
     return inside(module.tree, module.name)
+
+
+def function_lines(module: Module) -> int:
+    """Return the lines of the longest function of a module; of a command the list of options does not count."""
+    body = ".cli." in module.name
+    return max(
+        (
+            (node.end_lineno or 0) - (node.body[0] if body else node).lineno + 1 - len(docstring_lines(node))
+            for _, node in functions(module)
+        ),
+        default=0,
+    )
 
 
 def long_functions(modules: list[Module]) -> Found:
@@ -207,28 +250,53 @@ ROWS: dict[str, Callable[[list[Module]], Found]] = {
 def counts(root: Path) -> dict[str, int]:
     """Return the table of a checkout."""
     modules = modules_of(root)
+    rooms = Counter(map(room_of, modules))
+    sizes = {module.name: len(source_lines(module)) for module in modules}
     table = {"lines": sum(len(module.text.splitlines()) for module in modules)}
-    table["source lines"] = sum(map(source_lines, modules))
-    in_cli = [module for module in modules if module.name.startswith("groma.cli")]
-    table["source lines, cli"] = sum(map(source_lines, in_cli))
+    table["source lines"] = sum(sizes.values())
+    table["source lines, cli"] = sum(size for name, size in sizes.items() if name.startswith("groma.cli"))
+    table["repeated lines"] = repeated_lines(modules)
+    table["largest room"] = max(rooms.values())
+    table["longest module"] = max(len(module.text.splitlines()) for module in modules)
+    table["longest function"] = max(map(function_lines, modules))
     table |= {row: len(listed(modules)) for row, listed in ROWS.items()}
     numbers = sum(tuned_numbers.count(root / "src" / "groma").values(), Counter())
     table |= {f"numbers, {kind}": numbers[kind] for kind in tuned_numbers.KINDS}
+    table["numbers without an origin"] = sum(numbers[kind] for kind in tuned_numbers.KINDS)
     gates = sum(number for kind, number in numbers.items() if kind.startswith("gates"))
     return table | {"gates with origin": gates - numbers["gates without"]}
+
+
+def counts_of(commit: str, root: Path) -> dict[str, int]:
+    """Return the table of a commit of a checkout."""
+    command = ["git", "-C", str(root), "archive", commit, "src/groma"]
+    packed = subprocess.run(command, capture_output=True, check=True).stdout
+    with tempfile.TemporaryDirectory() as folder, tarfile.open(fileobj=io.BytesIO(packed)) as archive:
+        archive.extractall(folder, filter="data")
+        return counts(Path(folder))
 
 
 def main() -> None:
     """Print the table, or what one row counts."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parents[1], help="checkout to measure")
+    parser.add_argument("--since", metavar="COMMIT", help="show a commit of the checkout before it")
     parser.add_argument("--list", metavar="ROW", choices=ROWS, help="print what a row counts")
+    parser.add_argument("--rooms", action="store_true", help="print the source lines of every room")
     arguments = parser.parse_args()
+    if arguments.rooms:
+        rooms = Counter()
+        for module in modules_of(arguments.root):
+            rooms[room_of(module)] += len(source_lines(module))
+        print(*(f"{room:<40}{lines:>8,}" for room, lines in sorted(rooms.items())), sep="\n")
+        return
     if arguments.list:
         print(*ROWS[arguments.list](modules_of(arguments.root)), sep="\n")
         return
-    for row, count in counts(arguments.root).items():
-        print(f"{row:<30}{count:>8,}")
+    tables = [counts_of(arguments.since, arguments.root)] if arguments.since else []
+    tables.append(counts(arguments.root))
+    for row in tables[-1]:
+        print(f"{row:<30}" + "".join(f"{table[row]:>8,}" for table in tables))
 
 
 if __name__ == "__main__":

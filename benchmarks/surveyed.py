@@ -25,7 +25,8 @@ of the noise, instead.
 With ``--subsets`` the last adjustment is repeated for so many random choices of half of the images or more, all
 connected; scenes of fewer than ten images are left out one image at a time. Means over the choices, and in how many
 lines, and planes in addition, brought the centres nearer. With ``--draws`` it is repeated for so many draws of 70 % of
-the landmarks: mean and standard deviation of the error.
+the landmarks: mean and standard deviation of the errors of the centres and of the largest of a rotation, degrees, and
+of their difference with and without lines in the same draw.
 
 With ``--limits`` a row says how near the survey these photographs can come at all:
 
@@ -91,7 +92,7 @@ SHARED_POINTS, MANY_IMAGES = 60, 10
 DEVIATIONS = ["error", "stated", "by landmarks", "errors in deviations: stated", "by landmarks"]
 #: Share of the landmarks in a draw; columns.
 DRAWN = 0.7
-DRAWS = ["all points and lines", "all points, 70 % of the lines", "70 % of both", "70 % of the points alone"]
+DRAWS = ["points", "+ lines", "points, 70 % of the lines", "70 % of both", "70 % of the points alone", "lines bring"]
 LIMITS = ["one among surveyed", "at 2, 3, 5 sigma", "calibrated", "k1, k2", "gain", "tails"]
 #: Twice the logarithm of the likelihood that a result nearer the survey may cost.
 PRICES = (4.0, 9.0, 25.0)
@@ -175,21 +176,26 @@ def tell_subsets(folder: Path, survey: Scene, result: MapResult, count: int) -> 
 
 
 def tell_draws(folder: Path, survey: Scene, result: MapResult, count: int) -> None:
-    """Print a row: the centres' error with all landmarks, and its mean and deviation over draws of most of them."""
+    """Print a row: errors with all landmarks, and their mean and deviation over draws of most of them."""
     scene, options = result.before.replace(relations=Relations()), replace(result.adjusted_with, planes=False)
 
-    def error(scene: Scene, **kinds: bool) -> float:
-        return 1e3 * evaluate_poses(groma.adjust(scene, replace(options, **kinds)).scene, survey).center_rmse
+    def errors(scene: Scene, **kinds: bool) -> tuple[float, float]:
+        found = evaluate_poses(groma.adjust(scene, replace(options, **kinds)).scene, survey)
+        return 1e3 * found.center_rmse, found.rotation_deg_max
 
     rng, rows = np.random.default_rng(0), []
     for _ in range(count):
         lines, points = rng.random(scene.num_lines) < DRAWN, rng.random(scene.num_points) < DRAWN
         fewer = scene.keep(points=points)
-        rows.append([error(scene.keep(lines=lines)), error(fewer.keep(lines=lines)), error(fewer, lines=False)])
+        rows.append([errors(scene.keep(lines=lines)), errors(fewer.keep(lines=lines)), errors(fewer, lines=False)])
     table = np.array(rows)
-    spread = table.std(axis=0, ddof=1)
-    cells = [f"{error(scene):.2f}", *(f"{m:.2f} ± {s:.2f}" for m, s in zip(table.mean(axis=0), spread, strict=True))]
-    print(f"| {folder.name} | " + " | ".join(cells) + " |", flush=True)
+    table = np.concatenate([table, table[:, 1:2] - table[:, 2:]], axis=1)
+    mean, spread = table.mean(axis=0), table.std(axis=0, ddof=1)
+    whole = [errors(scene, lines=False), errors(scene)]
+    for name, digits, k in (("centres", 2, 0), ("largest rotation", 3, 1)):
+        cells = [f"{one[k]:.{digits}f}" for one in whole]
+        cells += [f"{m[k]:.{digits}f} ± {s[k]:.{digits}f}" for m, s in zip(mean, spread, strict=True)]
+        print(f"| {folder.name}, {name} | " + " | ".join(cells) + " |", flush=True)
 
 
 def subsets(scene: Scene, count: int) -> list[np.ndarray]:

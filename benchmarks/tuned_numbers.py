@@ -33,11 +33,12 @@ made
     Data that are made up: synthetic scenes, examples of factors and charts, conformance checks, what is run to compile.
 shapes
     Fields marked ``ClassVar`` (rows of a residual, columns of a table), and lengths, dimensions and counts compared
-    with less than eight: so many a minimal sample has, or so many names a message.
+    with less than eight: so many a minimal sample has, or so many names a message. Names that count from 0 on (states).
 formulas
     Factors that are units (percent, milli, seconds and minutes, bytes), degrees of a circle and the largest number of
     eight bits anywhere, powers and logarithms of ten, divisors 3, 4, 6, 8 and 12 (means, moments), 1.4826 (the
-    deviation of normal noise in median absolute deviations) and versions of Python.
+    deviation of normal noise in median absolute deviations) and versions of Python; in exponents the numbers from 30
+    on, which keep them from overflowing (1 + exp(-30) is 1 to 13 digits).
 
 Not counted anywhere: 0, 1, -1, 2 and one half, and numerical guards, which are below 1e-5 or from 1e5 on.
 
@@ -70,7 +71,7 @@ EXAMPLES = re.compile(r"(\w+_)?examples?$|random$")
 STATED = re.compile(r"\b(derived from|convention:|cost:)", re.IGNORECASE)
 UNITS, EVERYWHERE = {100, 1000, 60, 3600, 1024, 1.4826}, {90, 180, 360, 255}
 DIVISORS = {3, 4, 6, 8, 12}
-MAX_SAMPLE = 7
+MAX_SAMPLE, OVERFLOW = 7, 30
 Number: TypeAlias = tuple[str, int, float | str]
 
 
@@ -127,6 +128,9 @@ def _named(node: ast.stmt, lines: list[str]) -> Iterator[Number]:
     if names and all(name.isupper() for name in names):
         comment = _comment(node, lines)
         kind = "formats" if re.search(r"\bformat", comment) else "stated" if STATED.search(comment) else "named"
+        values = node.value.elts if isinstance(node.value, ast.Tuple) else []
+        if [getattr(value, "value", None) for value in values] == list(range(len(values))) != []:
+            kind = "shapes"
         yield from ((kind, node.lineno, value) for value in _numbers(node.value))
 
 
@@ -191,6 +195,10 @@ def _literals(node: ast.AST, compiled: bool, ordered: bool = False, kind: str = 
         return
     if isinstance(node, ast.Call | ast.Compare) and re.search(r"\blog\(10\.0\)$|^sys\.version", ast.unparse(node)):
         return
+    if isinstance(node, ast.Call) and ast.unparse(node.func).endswith(".exp"):
+        for part in ast.walk(node):
+            if isinstance(part, ast.Constant) and _counts(part.value) and part.value >= OVERFLOW:  # type: ignore[operator]
+                part.kind = "formulas"
     if isinstance(node, ast.Compare):
         ordered = any(isinstance(one, ast.Lt | ast.LtE | ast.Gt | ast.GtE) for one in node.ops)
         sized = any(_is_size(side) for side in (node.left, *node.comparators))
@@ -203,7 +211,7 @@ def _literals(node: ast.AST, compiled: bool, ordered: bool = False, kind: str = 
             yield from _literals(side, compiled, ordered, "formulas" if _is_formula(node, side) else kind)
         return
     if isinstance(node, ast.Constant) and _counts(node.value):
-        kind = "formulas" if node.value in EVERYWHERE else kind
+        kind = "formulas" if node.value in EVERYWHERE or node.kind == "formulas" else kind
         if isinstance(node.value, float) and (ordered or not compiled):
             yield kind or "floats", node.lineno, node.value
         elif isinstance(node.value, int) and ordered and node.value > 2:

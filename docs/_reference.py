@@ -4,6 +4,7 @@
 import importlib
 import pkgutil
 
+from _supported_names import public_names
 from docutils import nodes
 from docutils.statemachine import StringList
 from sphinx.application import Sphinx
@@ -26,10 +27,12 @@ class PackageReference(SphinxDirective):
         return [self._section(name) for name in dict.fromkeys(names)]
 
     def _section(self, name: str) -> nodes.Node:
-        is_package = hasattr(importlib.import_module(name), "__path__")
+        module = importlib.import_module(name)
+        # Constants of a module are its own affair unless it names them.
+        members = "" if hasattr(module, "__path__") else ", ".join(public_names(module))
         section = nodes.section(ids=[f"module-{name.replace('.', '-')}-section"])
         section += nodes.title(text=name)
-        lines = [f".. automodule:: {name}", "   :no-members:" if is_package else "   :members:", ""]
+        lines = [f".. automodule:: {name}", f"   :members: {members}" if members else "   :no-members:", ""]
         self.state.nested_parse(StringList(lines, source=f"<{name}>"), self.content_offset, section)
         return section
 

@@ -17,8 +17,11 @@ SHARED_DATA = ROOT.parent / "shared" / "data"
 SHARED_GOLDEN = ROOT.parent / "shared" / "math" / "golden"
 
 os.environ.setdefault("NUMBA_CACHE_DIR", str(ROOT / ".cache" / "numba"))
-# Every worker of a run keeps a core busy by itself.
+if "PYTEST_XDIST_WORKER" in os.environ:  # it keeps a core busy by itself
+    os.environ |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
 os.environ.setdefault("GROMA_COMPILE_PROCESSES", "0")
+#: Folders whose files take long, so that no worker is left with one of them at the end of a run.
+LONG = ("tracking", "hostile", "mapping", "viz", "localization", "cli", "adjustment")
 
 hypothesis.settings.register_profile(
     "groma",
@@ -34,14 +37,24 @@ hypothesis.settings.load_profile("groma")
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Give whole files to the workers of ``-n``: fixtures of a module are made once, and two workers seldom need the
-    same function compiled at the same moment."""
+    same function compiled at the same moment. In the order of the tests, not with the most numerous first."""
     from xdist.scheduler import LoadFileScheduling
 
+    config.option.loadscopereorder = False
     return LoadFileScheduling(config, log) if config.getvalue("dist") == "load" else None
 
 
+def _long_first(item: pytest.Item) -> tuple[int, int]:
+    folder = item.path.parent.name
+    return ("shared" not in item.keywords, LONG.index(folder) if folder in LONG else len(LONG))
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip what needs the data beside the checkout where there is none."""
+    """Put long files first in a run with several workers. Skip what needs the data beside the checkout where there is
+    none.
+    """
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        items.sort(key=_long_first)
     if SHARED_DATA.is_dir():
         return
     skip = pytest.mark.skip(reason="needs the data beside the checkout (../shared/data)")

@@ -137,5 +137,9 @@ def test_numbers_that_no_decision_hangs_on_stand_apart(tmp_path):
         "def f(a):\n    return 100.0 * a, a / 3.0, 10.0 ** a, a < 180.0, np.log(10.0), sys.version_info > (3, 9)\n"
     )
     assert counted("a/b.py", formulas) == {"formulas": 4}
+    states = "A, B, C, D = 0, 1, 2, 3\nE, F, G = 1, 2, 3\n"
+    assert counted("a/b.py", states) == {"shapes": 1, "named": 1}
+    exponents = "def f(a):\n    return np.exp(np.clip(a, -30.0, 30.0)), np.exp(9.0 * a), np.clip(a, -30.0, 30.0)\n"
+    assert counted("a/b.py", exponents) == {"formulas": 2, "floats": 3}
     others = "def f(a):\n    return a > 100.0, 3.0 * a, a / 5.0, a ** 10.0, np.log(a + 10.0)\n"
     assert counted("a/b.py", others) == {"floats": 5}

@@ -153,30 +153,41 @@ def test_camera_loss_and_factor_take_part_in_adjustments(python):
     python("-c", ADJUST)
 
 
+#: Commands, one after the other; each is followed by its exit code on standard error.
+COMMANDS = """
+import json, sys
+from groma.cli.main import run
+for words in json.loads(sys.argv[1]):
+    print("END", run(words), file=sys.stderr)
+"""
+
+
 def test_loss_chart_solver_and_format_by_name_on_the_command_line(python, tmp_path):
     write_scene(holistic(8, seed=0).start, tmp_path / "start.npz")
     options = ["--loss", "welsch", "--loss-scale", "6", "--line-chart", "centimetres", "--no-diagnosis"]
     options += ["--linear-solver", "eigenvalues", "--json", "report.json"]
-    python("-m", "groma.cli.main", "adjust", "start.npz", "-o", "end.npz", *options)
+    (tmp_path / "bad.segments").write_text("# segments: x1 y1 z1 x2 y2 z2\n1 2 three\n", encoding="utf-8")
+    commands = [["adjust", "start.npz", "-o", "end.npz", *options], ["convert", "end.npz", "end.segments"]]
+    commands += [["convert", "end.segments", "lines.npz"], ["convert", "bad.segments", "no.npz"]]
+    commands += [["convert", "end.npz", "no.thing"]]
+    _, said = python("-c", COMMANDS, json.dumps(commands))
+    *_, damaged, unknown, last = said.split("END ")
+    assert [part[0] for part in said.split("END ")[1:]] == ["0", "0", "0", "1", "1"] and last == "1\n"
     assert json.loads((tmp_path / "report.json").read_text())["linear_solver"] == "eigenvalues"
-    python("-m", "groma.cli.main", "convert", "end.npz", "end.segments")
-    python("-m", "groma.cli.main", "convert", "end.segments", "lines.npz")
     whole, lines = read_scene(tmp_path / "end.npz"), read_scene(tmp_path / "lines.npz")
     np.testing.assert_array_equal(lines.lines.segments, whole.lines.segments)
-    (tmp_path / "end.segments").write_text("# segments: x1 y1 z1 x2 y2 z2\n1 2 three\n", encoding="utf-8")
-    _, complaint = python("-m", "groma.cli.main", "convert", "end.segments", "no.npz", expected=1)
-    assert "not a usable file of segments" in complaint
-    _, complaint = python("-m", "groma.cli.main", "convert", "end.npz", "no.thing", expected=1)
-    assert ".segments for segments as text" in complaint
+    assert "not a usable file of segments" in damaged
+    assert ".segments for segments as text" in unknown
 
 
 def test_photographs_are_mapped_with_its_detector_and_matcher(python, tmp_path):
-    scene = facade(tmp_path / "photos", 4)
+    scene = facade(tmp_path / "photos", 3)
     write_scene(scene, tmp_path / "model.npz")
     options = ["--model", "model.npz", "--no-planes", "--no-diagnosis", "--line-matcher", "nearest"]
-    python("-m", "groma.cli.main", "map", "photos", "-o", "out", *options, "--line-detector", "hough")
+    commands = ["map", "photos", "-o", "out", *options, "--line-detector", "hough"], ["map", "photos", "-o", "no"]
+    _, complaint = python("-c", COMMANDS, json.dumps([commands[0], [*commands[1], "--line-detector", "huff"]]))
+    assert complaint.count("END 0") == complaint.count("END 1") == 1
     assert read_scene(tmp_path / "out" / "scene.npz").num_lines > 0
-    _, complaint = python("-m", "groma.cli.main", "map", "photos", "-o", "no", "--line-detector", "huff", expected=1)
     assert "There is no segment detector named 'huff'; choose one of hough, lsd, onnx:FILE." in complaint
 
 

@@ -33,7 +33,7 @@ _Result = TypeVar("_Result")
 
 #: Pieces of work that wait for each worker; more would only take memory.
 _WAITING = 2
-#: What glibc's ``mallopt`` calls the number of places that memory is taken from.
+#: What glibc's ``mallopt`` calls the number of places that memory is taken from (the format of the call).
 _M_ARENA_MAX = -8
 #: Calls to an executor of processes that each of its workers gets, so that all end at about the same time (cost: of
 #: waiting for the last).
@@ -126,6 +126,12 @@ def num_threads() -> int:
     """Return how many threads of this process do what is not sent to others, one without :func:`work_with`."""
     crew = _CREW.get()
     return 1 if crew is None else crew.here.workers
+
+
+def num_calls() -> int:
+    """Return into how many calls work is divided that is sent to other processes; zero where they share memory."""
+    crew = _CREW.get()
+    return 0 if crew is None or crew.executor is None or crew.shares_memory else _CALLS * crew.workers
 
 
 def map_work(

@@ -44,6 +44,7 @@ def test_parts_hold_every_landmark_once_with_its_observations(scene, tmp_path):
     assert not measured
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("lines", [False, True])
 def test_result_is_that_of_the_whole_scene(scene, tmp_path, lines):
     scene = scene if lines else scene.points_only()
@@ -61,6 +62,7 @@ def test_result_is_that_of_the_whole_scene(scene, tmp_path, lines):
         assert (part.points.xyz != before.points.xyz).any() or part.num_points == 0
 
 
+@pytest.mark.compiled
 def test_a_robust_loss_is_used(scene, tmp_path):
     table = scene.point_observations
     pixel = table.pixel.copy()
@@ -72,6 +74,7 @@ def test_a_robust_loss_is_used(scene, tmp_path):
     np.testing.assert_allclose(result.report.final_cost, whole.report.solve.final_cost, rtol=1e-6)
 
 
+@pytest.mark.compiled
 def test_intrinsics_are_estimated_if_asked(scene, tmp_path):
     scene = scene.points_only()
     paths = write_parts(scene, tmp_path / "parts", observations=200)
@@ -100,6 +103,7 @@ def test_refuses_what_does_not_belong_together(scene, tmp_path):
         write_parts(scene, tmp_path / "x", observations=0)
 
 
+@pytest.mark.compiled
 def test_results_are_not_overwritten_unasked(scene, tmp_path):
     paths = write_parts(scene, tmp_path / "parts", observations=300)
     adjust_parts(paths, tmp_path / "out", options=SolverOptions(max_iterations=1))

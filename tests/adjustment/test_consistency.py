@@ -16,6 +16,7 @@ from groma.factors import LineDirection, PointOnLine, PointOnPlane, SegmentOnPla
 pytestmark = pytest.mark.kernels
 
 
+@pytest.mark.compiled
 def test_every_kind_in_both_gauges():
     report = consistency(runs=4, seed=0, num_images=8)
     assert [(row.gauge, row.kind) for row in report.rows] == [
@@ -27,6 +28,7 @@ def test_every_kind_in_both_gauges():
     assert json.loads(json.dumps(report.to_dict(), allow_nan=False))["passed"] is True
 
 
+@pytest.mark.compiled
 def test_wrong_noise_is_noticed():
     report = consistency(runs=4, seed=0, num_images=8, noise_px=0.5, believed_px=0.35, gauges=("held",))
     assert not report.passed

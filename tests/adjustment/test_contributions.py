@@ -18,8 +18,6 @@ from groma.scene import Planes, Relations, Similarity, synthetic
 from groma.viz.report.charts import spreads
 from groma.viz.report.tables import contributions_card
 
-pytestmark = pytest.mark.kernels
-
 OPTIONS = groma.AdjustOptions(loss="none", threads=1)
 
 

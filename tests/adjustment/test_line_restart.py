@@ -77,6 +77,7 @@ def test_second_start_counts_under_relations_too(scenes):
     assert _sine(better.variables["lines"].ambient()[BAD], truth.lines.plucker[BAD]) < 0.02
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("loss", ["none", "auto"])
 def test_adjust_recovers(scenes, loss):
     truth, wrong = scenes
@@ -107,6 +108,7 @@ def test_held_lines_stay(scenes):
     assert len(renewed) == 0
 
 
+@pytest.mark.compiled
 def test_few_steps_where_a_line_starts_in_a_wrong_minimum():
     """Twelve steps were needed before the first stage ended at a refused step."""
     start = synthetic.holistic(100, noise_px=1.0, seed=1, views="near").start

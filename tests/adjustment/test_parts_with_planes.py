@@ -35,7 +35,7 @@ def planes_seen(truth):
     return PlaneObservations(image, plane, np.column_stack([normal, offset]), information)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def scene():
     """Points, lines, planes, directions, relations of all kinds, planes measured in cameras, known poses."""
     made = synthetic.holistic(30, noise_px=0.2, rotation_deg=0.1, translation=0.005, structure=0.01)
@@ -116,6 +116,7 @@ def test_parts_are_joined_to_what_was_cut(scene, tmp_path):
 OPTIONS = AssemblyOptions(max_coupled_lines=0)  # as in parts
 
 
+@pytest.mark.compiled
 def test_the_solution_is_that_of_the_whole(scene, tmp_path):
     """States of all kinds, to 1e-9 of their size: known poses hold the scene, so that the minimum is one point."""
     paths = write_parts(scene, tmp_path / "parts", SIZE)
@@ -136,6 +137,7 @@ def test_the_solution_is_that_of_the_whole(scene, tmp_path):
     assert result.adjustment.relations["line_on_plane"] == {"held": len(scene.relations.line_on_plane), "dropped": 0}
 
 
+@pytest.mark.compiled
 def test_the_gauge_is_that_of_the_whole(tmp_path):
     """Without known poses the first camera is held, and of the farthest one what tells the scale."""
     scene = synthetic.corridor("tiny").start
@@ -150,6 +152,7 @@ def test_the_gauge_is_that_of_the_whole(tmp_path):
     np.testing.assert_array_equal(held, (found[1] == found[2]).all(axis=1))
 
 
+@pytest.mark.compiled
 def test_relations_that_fail_are_given_up_as_in_the_whole(scene, tmp_path):
     """Points that were said to lie on planes far away."""
     wrong = scene.relations.point_on_plane.copy()
@@ -168,6 +171,7 @@ def test_relations_that_fail_are_given_up_as_in_the_whole(scene, tmp_path):
     assert pairs_of(found, "point_on_plane") == pairs_of(whole.scene, "point_on_plane")
 
 
+@pytest.mark.compiled
 def test_other_planes_are_refused_unless_left_out(scene, tmp_path, capsys):
     paths = write_parts(scene.replace(pose_priors=PosePriors()), tmp_path / "parts", SIZE)
     other = groma.read_scene(paths[1])
@@ -197,6 +201,7 @@ def test_convert_cuts_and_joins(scene, tmp_path, capsys):
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
+@pytest.mark.compiled
 @needs_mpi
 def test_two_ranks_write_what_one_process_writes(scene, tmp_path):
     """Relations of all kinds, in two robust stages; what travels has blocks between planes and cameras."""

@@ -92,6 +92,7 @@ def test_a_start_from_the_motions_alone(rng):
     np.testing.assert_allclose(lost.chained().poses.world_from_body, truth, atol=1e-12)
 
 
+@pytest.mark.compiled
 def test_a_wrong_motion_loses(rng):
     _, graph = ring(rng, count=30, noise=0.01)
     motions = graph.motions
@@ -110,6 +111,7 @@ def test_a_wrong_motion_loses(rng):
     assert moved["none"] > 0.5 and max(moved["cauchy"], moved["geman_mcclure"]) < 0.05
 
 
+@pytest.mark.compiled
 def test_odometry_keeps_its_weight_unless_told(rng):
     _, graph = ring(rng, count=30, noise=0.01)
     assert graph.odometry().sum() == 29

@@ -8,8 +8,6 @@ import groma
 from groma.evaluation import evaluate_poses
 from groma.scene import Relations, synthetic
 
-pytestmark = pytest.mark.kernels
-
 
 @pytest.fixture(scope="module")
 def scenes():

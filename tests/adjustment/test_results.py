@@ -20,6 +20,7 @@ def scene():
     return synthetic.holistic(6, seed=3).start
 
 
+@pytest.mark.compiled
 def test_a_summary_is_what_the_command_writes(scene, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     groma.write_scene(scene, "start.npz")
@@ -48,6 +49,7 @@ def test_a_summary_is_what_the_command_writes(scene, tmp_path, monkeypatch):
         groma.write_covariances("call.txt", result.scene, uncertainty)
 
 
+@pytest.mark.compiled
 def test_a_result_speaks_of_the_problem_that_was_solved(scene):
     """Twice the noise, twice the standard deviation; the function on the scene alone would not know."""
     sigma = []

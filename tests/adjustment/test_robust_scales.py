@@ -30,6 +30,7 @@ def test_last_scale_follows_the_noise():
         assert _wide_enough(other, assembly) is other
 
 
+@pytest.mark.compiled
 def test_without_outliers_the_default_is_as_good_as_least_squares():
     truth, start = _scene(1.5)
     errors = [
@@ -39,6 +40,7 @@ def test_without_outliers_the_default_is_as_good_as_least_squares():
     assert errors[0] < 1.03 * errors[1]
 
 
+@pytest.mark.compiled
 def test_with_outliers_it_is_far_better():
     truth, start = _scene(0.5)
     table = start.point_observations

@@ -94,12 +94,17 @@ def test_noise_of_rows_does_not_bias_motions(monkeypatch):
 
 def test_images_at_once_have_no_motions():
     poses, motions = photographs()
-    found = adjust_rolling_shutter(with_rolling_shutter(rolling_scene(poses, 0.0 * motions)), NOISE)
-    assert np.abs(found.result.scene.camera_motions.motion[:, :3]).max() < 0.01
-    assert np.degrees(np.abs(found.result.scene.camera_motions.motion[:, 3:])).max() < 0.1
-    words = " ".join(found.motions.warnings())
-    assert "rest by" in words and "The images show next to no rolling shutter" in words
+    still = rolling_scene(poses, 0.0 * motions)
+    found = adjust_rolling_shutter(with_rolling_shutter(still), NOISE)
+    # What was found is noise, is told alone, and does not touch the scene.
+    assert np.abs(found.motions.motion[:, :3]).max() < 0.01
+    assert np.degrees(np.abs(found.motions.motion[:, 3:])).max() < 0.1
     assert found.motions.explained is not None and found.motions.explained < 0.05
+    (warning,) = found.motions.warnings()
+    assert found.motions.left_out and "The images show next to no rolling shutter" in warning
+    assert found.motions.sentences() == () and found.motions.to_dict()["left_out"]
+    assert not len(found.result.scene.camera_motions)
+    np.testing.assert_array_equal(found.result.scene.cam_from_world, adjust(still, NOISE).scene.cam_from_world)
 
 
 def test_motions_are_kept_moved_and_cut(tmp_path):

@@ -46,6 +46,7 @@ def test_true_scene_has_no_pixel_difference(holistic):
             assert np.abs(residual).max() < 1e-8
 
 
+@pytest.mark.compiled
 def test_both_forms_pull_landmarks_to_their_planes(holistic):
     """Against the adjustment without relations, the distances from planes shrink to a fraction."""
     relations = holistic.start.relations
@@ -70,6 +71,7 @@ def test_unknown_form_is_refused(holistic):
         groma.adjust(holistic.start, groma.AdjustOptions(structure_form="inches"))
 
 
+@pytest.mark.compiled
 def test_robust_pixel_form_does_not_drift(holistic):
     """Segments on planes are compared at ends that do not move with the scene; a free gauge would creep for ever."""
     result = groma.adjust(holistic.start, groma.AdjustOptions(structure_form="pixels"))

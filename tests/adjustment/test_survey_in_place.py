@@ -20,7 +20,7 @@ from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.places import at_places_of
 from groma.adjustment.survey.align import align
 from groma.adjustment.survey.attach import Survey, with_survey
-from groma.adjustment.survey.names import rows_by_name
+from groma.adjustment.survey.names import rows_by_name, tell_partly
 from groma.adjustment.survey.reliability import reliability
 from groma.adjustment.survey.similarity import robust_similarity
 from groma.errors import InputError
@@ -152,7 +152,12 @@ def test_gross_errors_do_not_move_the_similarity():
 
 def test_names_are_found_without_folder_and_ending():
     known = ("left/a.JPG", "left/b.jpg", "right/b.jpg", "c.png")
-    assert rows_by_name(["A.jpg", "right\\b.jpg", "b.jpg", "c", "c.jpg", "d"], known).tolist() == [0, 2, -1, 3, 3, -1]
+    wanted = ["A.jpg", "right\\b.jpg", "b.jpg", "c", "c.jpg", "d"]
+    found = rows_by_name(wanted, known)
+    assert found.tolist() == [0, 2, -1, 3, 3, -1]
+    words = "p.csv: 3 names of images were found without folder or ending, such as A.jpg for left/a.JPG."
+    assert tell_partly(found, wanted, known, "p.csv") == [words]
+    assert tell_partly(found[1:3], wanted[1:3], known, "p.csv") == []
 
 
 def refused(scene, words, **survey):

@@ -168,7 +168,12 @@ def test_axes_of_phones_are_checked(truth):
     with pytest.raises(InputError, match="OpenGL"):
         with_survey(rolled, Survey(directions=replace(opengl, vectors=opengl.vectors * [1, -1, -1])))
     upward = DirectionsFile(given.names, -given.vectors, given.in_world, given.sigma_deg, "imu.txt")
-    assert any("Accelerometers measure up" in note for note in with_survey(truth, Survey(directions=upward)).notes)
+    one = np.array([[0.0, 0.0, -1.0]])
+    sky = DirectionsFile(given.names[:1], one, one, given.sigma_deg[:1], "imu.txt")
+    ground = replace(sky, vectors=-one)  # of a camera that looks straight down
+    for file, told in ((upward, True), (given, False), (sky, True), (ground, False)):
+        notes = with_survey(truth, Survey(directions=file)).notes
+        assert any("Accelerometers measure up" in note for note in notes) == told
 
 
 def test_lines_have_known_directions(truth):

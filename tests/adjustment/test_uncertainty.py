@@ -82,6 +82,7 @@ def test_diagnosis_uses_the_names_of_the_scene():
     assert any("00005.png" in sentence for sentence in diagnosis.sentences), diagnosis.sentences
 
 
+@pytest.mark.compiled
 def test_relations_do_not_tell_the_scale():
     """Points on lines and planes miss these by little, and by less in a smaller scene: the scale is free all the same.
 

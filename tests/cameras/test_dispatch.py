@@ -75,6 +75,7 @@ print(sum(pixels.stats.cache_hits.values()), sum(pixels.stats.cache_misses.value
 """
 
 
+@pytest.mark.compiled
 def test_a_loop_over_two_models_is_cached_on_disk(tmp_path):
     """The second process compiles nothing and gives the same numbers."""
     script = tmp_path / "cached_loop.py"

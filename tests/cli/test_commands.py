@@ -18,6 +18,7 @@ from groma.io import read_scene, write_scene
 pytestmark = pytest.mark.kernels
 
 
+@pytest.mark.compiled
 def test_adjust(scenes, here, capsys):
     assert run(["adjust", str(scenes / "points.npz"), "-o", "out.npz", "--json", "r.json", "--report", "p.html"]) == 0
     said = capsys.readouterr()
@@ -38,6 +39,7 @@ def test_adjust(scenes, here, capsys):
     assert sorted(os.listdir(here)) == ["out.npz", "p.html", "r.json"]
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("form", ["bearing", "normal"])
 def test_adjust_by_other_residuals_of_lines(scenes, here, form):
     arguments = ["adjust", str(scenes / "start.npz"), "--no-planes", "--gauge", "first_camera", "--json", "r.json"]

@@ -42,7 +42,7 @@ def test_gravity_and_heights(folder, tmp_path, capsys, monkeypatch):
     words += f" --known-planes {folder}/levels.txt --protocol adjustment.txt --json out.json --report out.html"
     assert run(words.split()) == 0
     said = capsys.readouterr()
-    assert "turned by" in said.out and "Taken out as wrong: known direction 00004.png" in said.err
+    assert "turned by" in said.out and "Taken out: known direction 00004.png" in said.err and " degrees (" in said.err
     scene, truth = read_scene("out.npz"), read_scene(folder / "truth.npz")
     off = scene.cam_centers_in_world[:, 2] - truth.cam_centers_in_world[:, 2]
     assert np.sqrt((off**2).mean()) < 0.02  # the heights scale it, too

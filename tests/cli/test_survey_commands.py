@@ -14,7 +14,7 @@ from groma.cli.main import run
 from groma.io import read_scene, write_scene
 from groma.io.survey import CoordinateSystem, Places
 from groma.mapping import map as mapping
-from groma.mapping.map import MapResult, map_images
+from groma.mapping.map import MapOptions, MapResult, map_images
 from groma.scene.local_frame import usual_frame
 
 UTM = np.array([4e5, 5.4e6, 200.0])
@@ -57,7 +57,9 @@ def test_adjust_with_everything(folder, tmp_path, capsys, monkeypatch):
     assert run(words.split()) == 0
     said = capsys.readouterr()
     assert "brought into UTM zone 33 north (EPSG:32633)" in said.out and "Check point p4: off by" in said.out
-    assert "Taken out as wrong: camera position 00003.png y" in said.err
+    assert (
+        "Taken out: camera position 00003.png y disagrees with photographs and other measurements by 0.98" in said.err
+    )
     scene, truth = read_scene("out.npz"), read_scene(folder / "truth.npz")
     off = scene.cam_centers_in_world - truth.cam_centers_in_world - UTM
     assert np.sqrt((off**2).mean()) < 0.8 * SIGMA
@@ -89,7 +91,23 @@ def test_accuracies_that_are_too_good_are_told(folder, tmp_path, capsys, monkeyp
     told = json.loads((tmp_path / "r.json").read_text())["survey"]
     assert told["variance_components"]["camera position"] > 4.0
     error = capsys.readouterr().err
-    assert "camera positions are" in error and "times as large" in error and "Probably wrong" not in error
+    assert "camera positions are" in error and "times as large" in error and "Suspect" not in error
+
+
+def test_suspects_may_be_kept(folder, tmp_path, capsys, monkeypatch):
+    """What the test would take out goes on weighing, in a first adjustment and in a later one."""
+    monkeypatch.chdir(tmp_path)
+    words = f"adjust {folder}/scene.npz --positions {folder}/positions.txt"
+    assert run([*words.split(), "-o", "out.npz"]) == 0
+    assert "keep it with --keep-suspects" in capsys.readouterr().err
+    assert run([*words.split(), "-o", "kept.npz", "--keep-suspects"]) == 0
+    said = capsys.readouterr().err
+    assert "Suspect: camera position 00003.png y disagrees" in said and "Taken out" not in said
+    assert run(["adjust", "out.npz", "-o", "later.npz", "--keep-suspects"]) == 0
+    rejected = [read_scene(name).camera_positions.rejected.sum() for name in ("out.npz", "kept.npz", "later.npz")]
+    assert rejected == [1, 0, 0]
+    assert run(["adjust", f"{folder}/scene.npz", "--keep-suspects"]) == 1
+    assert "--keep-suspects is of measurements; there are none" in capsys.readouterr().err
 
 
 def test_align(folder, tmp_path, capsys, monkeypatch):
@@ -129,12 +147,14 @@ def test_what_does_not_fit_is_one_line(folder, tmp_path, capsys, monkeypatch, op
     assert words in error[-1] and len(error) == 1
 
 
-def test_a_map_is_in_the_frame_of_its_measurements(tmp_path, monkeypatch):
-    """What is between the points and the end is looked at without photographs."""
+@pytest.mark.parametrize("kept", [False, True])
+def test_a_map_is_in_the_frame_of_its_measurements(tmp_path, monkeypatch, kept):
+    """What is between the points and the end is looked at without photographs. One position is wrong."""
     truth, start = made()
     near = adjust(start, AdjustOptions(loss="none"))
     rng, seen = np.random.default_rng(5), []
     xyz = positions(truth, rng).xyz + UTM
+    xyz[2, 1] += 1.0
     given = Places(truth.images.names, xyz, np.full(xyz.shape, SIGMA), CoordinateSystem(), "positions.csv")
 
     def mapped(points, *others):
@@ -144,8 +164,10 @@ def test_a_map_is_in_the_frame_of_its_measurements(tmp_path, monkeypatch):
     monkeypatch.setattr(mapping, "map_segments", mapped)
     for name in truth.images.names:
         cv2.imwrite(str(tmp_path / name), np.zeros((768, 1024), np.uint8))
-    found = map_images(tmp_path, tmp_path / "work", start.transformed(ELSEWHERE), survey=Survey(positions=given))
+    options = MapOptions(keep_suspects=kept)
+    found = map_images(tmp_path, tmp_path / "work", start.transformed(ELSEWHERE), options, survey=Survey(given))
     assert usual_frame(seen[0]) is None and len(seen[0].camera_positions) == 8
+    assert seen[0].camera_positions.rejected.sum() == (0 if kept else 1)
     off = found.scene.cam_centers_in_world - truth.cam_centers_in_world - UTM
     assert np.abs(off).max() < 3 * SIGMA and np.abs(found.start.cam_centers_in_world[0] - UTM).max() < 100
     np.testing.assert_allclose(found.scene.camera_positions.xyz, xyz, atol=1e-6)

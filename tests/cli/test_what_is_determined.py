@@ -25,6 +25,7 @@ from groma.scene import Relations
 pytestmark = pytest.mark.kernels
 
 
+@pytest.mark.compiled
 def test_adjust_says_what_the_data_determine(scenes, here, capsys):
     arguments = ["adjust", str(scenes / "start.npz"), "--report", "p.html", "--json", "r.json", "--verbose"]
     assert run(arguments) == 0
@@ -114,6 +115,7 @@ def test_covariances_in_a_file(scenes, here, capsys, gauge):
     assert json.loads((here / "r.json").read_text())["uncertainty"]["gauge"] == gauge
 
 
+@pytest.mark.compiled
 def test_the_page_of_an_adjustment_knows_its_covariances(scenes, here):
     """As groma report --covariance puts them on a page; without --covariance there are none."""
     adjust = ["adjust", str(scenes / "points.npz"), "--quiet", "--max-iterations", "3"]
@@ -145,6 +147,7 @@ def test_covariances_that_are_impossible_do_not_cost_the_result(scenes, here, ca
     assert sorted(os.listdir(here)) == ["out.npz", "r.json"]
 
 
+@pytest.mark.compiled
 def test_standard_deviations_in_a_file(scenes, here):
     arguments = ["adjust", str(scenes / "start.npz"), "--quiet", "-f", "--covariance"]
     assert run([*arguments, "one.json"]) == 0 and run([*arguments, "two.json", "--sigma0", "2"]) == 0

@@ -88,7 +88,6 @@ def test_chance_is_told_apart_where_it_is_below_all_numbers():
     assert alarms[1] < 5 * alarms[0] < -300
 
 
-@pytest.mark.kernels
 def test_coplanar_walls_far_apart_are_two_planes():
     rng = np.random.default_rng(4)
     points = np.concatenate([wall(rng, 200, 0, 0.0), wall(rng, 200, 0, 0.0, shift=(40.0, 0.0))])
@@ -136,7 +135,6 @@ def test_many_planes_are_found():
     assert 118 <= len(find_planes(points, noise_of(points))) <= 121
 
 
-@pytest.mark.kernels
 def test_segments_make_planes_too():
     rng = np.random.default_rng(5)
     ends = rng.uniform(0, 4, (40, 2, 2))

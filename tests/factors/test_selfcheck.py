@@ -25,6 +25,7 @@ def two_factors(monkeypatch):
     monkeypatch.setattr(_factor, "_REGISTRY", {name: registered()[name] for name in names})
 
 
+@pytest.mark.compiled
 def test_covers_every_factor_and_block():
     report = selfcheck(seed=3)
     assert report.passed

@@ -10,10 +10,16 @@ import pytest
 from groma.errors import ShapeError
 from groma.factors.checks.check import _ambients, _linearize, _residuals
 from groma.factors.contract import Ref, registered
-from groma.factors.relations.line_direction import LineDirection
+from groma.factors.relations.direction_pairs import (
+    LineDirection,
+    LineParallelToPlane,
+    LinePerpendicularToPlane,
+    OrthogonalLines,
+    OrthogonalPlanes,
+    ParallelLines,
+    ParallelPlanes,
+)
 from groma.factors.relations.line_on_plane import LineOnPlane, SegmentOnPlane
-from groma.factors.relations.orthogonal import LineParallelToPlane, OrthogonalLines, OrthogonalPlanes
-from groma.factors.relations.parallel import LinePerpendicularToPlane, ParallelLines, ParallelPlanes
 from groma.factors.relations.point_on_line import PointOnLine
 from groma.factors.relations.point_on_plane import PointOnPlane
 

@@ -86,6 +86,7 @@ def test_one_side_without_depth():
     np.testing.assert_allclose(found.end_points, on_plane(ends.reshape(1, 2, 2), SLOPED), rtol=0, atol=1e-4)
 
 
+@pytest.mark.compiled
 def test_covariance_is_that_of_the_errors():
     rng = np.random.default_rng(11)
     surface, _ = render([SLOPED])

@@ -38,6 +38,7 @@ def test_exact_planes_are_found_exactly():
     assert np.abs(on_plane).max() < 0.02
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("step", [1, 2])
 def test_covariance_is_that_of_the_errors(step):
     rng = np.random.default_rng(5)

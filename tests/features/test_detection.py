@@ -56,6 +56,7 @@ def test_an_axis_parallel_edge_is_placed_at_every_fraction_of_a_pixel():
         np.testing.assert_allclose(top[0, [1, 3]], corners[0, 1], atol=0.035)  # a sharp edge is undersampled
 
 
+@pytest.mark.compiled
 def test_sigma_agrees_with_the_errors_made():
     for noise in (4.0, 12.0):
         distances, _, sigma = _signed_errors(LsdDetector(min_length=15.0), seed=7, count=16, noise=noise)
@@ -89,6 +90,7 @@ def test_two_edges_at_an_obtuse_corner_stay_two():
     assert distance.max() < 0.5
 
 
+@pytest.mark.compiled
 def test_sigma_grows_with_noise():
     quiet = _signed_errors(LsdDetector(), seed=3, count=6, noise=2.0)[2]
     loud = _signed_errors(LsdDetector(), seed=3, count=6, noise=20.0)[2]

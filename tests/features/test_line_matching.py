@@ -77,6 +77,7 @@ def _point_matches(H, seed=1, count=150, wrong=0.1):
 
 
 # ---------------------------------------------------------------------------------------------------- Descriptors
+@pytest.mark.compiled
 def test_descriptor_ignores_brightness_and_contrast():
     rng = np.random.default_rng(3)
     scene = board(rng)
@@ -89,6 +90,7 @@ def test_descriptor_ignores_brightness_and_contrast():
     assert np.linalg.norm(one - two, axis=1).max() < 0.12  # rounding to grey levels only
 
 
+@pytest.mark.compiled
 def test_descriptor_turns_with_the_image():
     image = to_uint8(board(np.random.default_rng(4)))
     segments = LsdDetector(min_length=12.0).detect(image)
@@ -98,6 +100,7 @@ def test_descriptor_turns_with_the_image():
     assert np.linalg.norm(describe(image, segments) - describe(turned, there), axis=1).max() < 0.2
 
 
+@pytest.mark.compiled
 def test_descriptor_scale_undoes_an_enlargement():
     image = to_uint8(board(np.random.default_rng(6)))
     segments = LsdDetector(min_length=15.0).detect(image)
@@ -118,6 +121,7 @@ def test_descriptor_of_nothing_is_zero():
 
 
 # -------------------------------------------------------------------------------------------------- Wide baseline
+@pytest.mark.compiled
 @pytest.mark.parametrize("H", [MILD, STRONG], ids=["mild", "strong"])
 def test_wide_baseline_on_a_warp(H):
     images, (one, two) = _warped(H, gain=0.8, offset=15.0)
@@ -129,6 +133,7 @@ def test_wide_baseline_on_a_warp(H):
     assert recall > 0.7
 
 
+@pytest.mark.compiled
 def test_matches_are_one_to_one_scored_deterministic_and_symmetric():
     images, (one, two) = _warped(STRONG, seed=2)
     first, second, points = describe(images[0], one), describe(images[1], two), _point_matches(STRONG)
@@ -232,6 +237,7 @@ def test_nearby_points_against_a_plain_count():
 
 
 # ------------------------------------------------------------------------------------------------------------ Flow
+@pytest.mark.compiled
 def test_flow_on_a_warp():
     images, (one, two) = _warped(MILD, seed=3)
     truth = _true_pairs(MILD, one, two)
@@ -242,6 +248,7 @@ def test_flow_on_a_warp():
     assert recall > 0.8
 
 
+@pytest.mark.compiled
 def test_flow_of_an_image_to_itself_is_the_identity():
     (image, _), (one, _) = _warped(MILD, seed=5)
     found = match_by_flow(image, image, one, one)
@@ -249,6 +256,7 @@ def test_flow_of_an_image_to_itself_is_the_identity():
     assert len(found) > 0.9 * len(one)
 
 
+@pytest.mark.compiled
 def test_a_wrong_backward_flow_is_noticed():
     images, (one, two) = _warped(MILD, seed=3)
     forward = dense_flow(*images)

@@ -19,11 +19,11 @@ pytestmark = pytest.mark.skipif(os.name == "nt", reason="processes are forked, a
 
 def test_some_thousand_mutations():
     finished = subprocess.run(
-        [sys.executable, str(HERE / "_runner.py"), "--cases", "2500", "--seed", "1"],
+        [sys.executable, str(HERE / "_runner.py"), "--cases", "1500", "--seed", "1"],
         capture_output=True, text=True, timeout=500,
     )  # fmt: skip
     assert finished.returncode == 0, finished.stdout[-4000:] + finished.stderr[-2000:]
-    assert "2,500 mutated files" in finished.stdout
+    assert "1,500 mutated files" in finished.stdout
 
 
 BROKEN = """
@@ -122,7 +122,7 @@ def test_small_files_stay_small(tmp_path):
     """Half a megabyte may take less than a gigabyte, whether it is read or refused."""
     texts = {
         "1-trajectory.gz": _gzip_of(b"0 0 0 0 0 0 0 1\n", 48 << 20),
-        "2-trajectory.gz": _gzip_of(b"0 0 0 0 0 0 0 1\n", 12 << 20),
+        "2-trajectory.gz": _gzip_of(b"0 0 0 0 0 0 0 1\n", 4 << 20),
         "3-trajectory.gz": _gzip_of(b"a\n", 30 << 20),
         "4-g2o.gz": _gzip_of(b"VERTEX_SE2 1 1 1 1\n", 12 << 20),
         "5-g2o.gz": _gzip_of(b"FIX 1 1 1 1 1 1 1 1 1 1 1 1 1 1 1\n", 12 << 20),

@@ -81,6 +81,18 @@ def test_colmap_poses_are_those_of_pycolmap(tmp_path):
     assert {element.image_id for element in model.points3D[4].track.elements} == {10, 11, 12, 13, 20}
 
 
+def test_binary_models_are_read_as_pycolmap_reads_them(tmp_path):
+    """2D points are taken from the file, all else from pycolmap; those without a point in space are keypoints."""
+    import pycolmap
+
+    scene = rig_scene().points_only()
+    write_colmap(scene, tmp_path / "model")
+    found, expected = read_colmap(tmp_path / "model"), from_pycolmap(pycolmap.Reconstruction(str(tmp_path / "model")))
+    assert len(found.keypoints) > 0
+    result = equal(found, expected)
+    assert result, result.reason
+
+
 def test_colmap_model_is_found_in_sparse_folders(tmp_path):
     scene = rig_scene().points_only()
     (tmp_path / "one").mkdir()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Damaged files: 3 000 truncations and mutations give a valid scene or an error of groma, never anything else.
+"""Damaged files: 1 500 truncations and mutations give a valid scene or an error of groma, never anything else.
 
 They run in this process: an abort, a hang (see the timeouts) or a foreign exception of any reader fails the test. Each
 operation was chosen because it broke a reader once: huge counts made pycolmap read for hours.
@@ -22,7 +22,7 @@ from groma.io import read_scene, read_tum, write_archive, write_colmap
 from groma.scene import Scene
 
 BAL = Path(__file__).parents[1] / "data" / "bal"
-EXAMPLES = settings(max_examples=500)
+EXAMPLES = settings(max_examples=200)
 
 NUMBERS = [struct.pack("<d", value) for value in (float("nan"), float("inf"), 1e308, -1.0, 0.0)]
 NUMBERS += [struct.pack("<Q", value) for value in (2**64 - 1, 2**63, 2**40, 2**31, 2**20, 0, 1)]
@@ -122,7 +122,7 @@ def test_bal(tmp_path, suffix):
 def test_damage_inside_a_compressed_bal_file(tmp_path):
     text = (BAL / "dubrovnik-3-7-pre.txt").read_bytes()
 
-    @settings(max_examples=200)
+    @EXAMPLES
     @given(damages())
     def run(damage):
         (tmp_path / "problem.bz2").write_bytes(bz2.compress(damage(text)))
@@ -148,7 +148,7 @@ def test_archive(workshop):
 def test_tum(tmp_path):
     content = b"".join(b"%d.5 1 2 3 0 0.6 0 0.8\n" % row for row in range(4))
 
-    @settings(max_examples=200)
+    @EXAMPLES
     @given(damages())
     def run(damage):
         (tmp_path / "trajectory.txt").write_bytes(damage(content))

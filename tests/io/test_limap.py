@@ -286,7 +286,6 @@ def _shifted(table: np.ndarray, name: str, by: int) -> np.ndarray:
     return moved
 
 
-@pytest.mark.kernels
 @pytest.mark.parametrize("form", ["binary", "text"])
 def test_adjust_keeps_what_it_does_not_model(tmp_path, form):
     """`groma adjust` on LIMAP's output: landmarks move, all else of the structures stays."""

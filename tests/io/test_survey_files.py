@@ -134,6 +134,30 @@ def test_without_pyproj_it_says_what_to_install(monkeypatch):
         common_frame([places([[9.0, 48.0, 0.0]] * 2)], "utm")
 
 
+@pytest.mark.parametrize("mark", [" ", ";", "\t"])
+def test_decimal_commas_are_named(tmp_path, mark):
+    (tmp_path / "p.txt").write_text(mark.join(["a.jpg", "4,25", "-5,5", "6,0", "0,02"]))
+    with pytest.raises(FileFormatError, match="has decimal commas"):
+        read_positions(tmp_path / "p.txt")
+    (tmp_path / "p.txt").write_text("a.jpg, 4, 5, 6\nb.jpg; 4; 5; 7")
+    assert read_positions(tmp_path / "p.txt").coordinates.tolist() == [[4, 5, 6], [4, 5, 7]]
+
+
+def test_a_system_that_cannot_be_checked_is_told(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "pyproj", None)
+    group = places([[600000.0, 5400000.0, 7.5]] * 2, "EPSG:99999")
+    assert "EPSG:99999 (as written; whether there is such" in common_frame([group])[1].description
+
+
+def test_a_system_that_does_not_exist_is_refused():
+    pytest.importorskip("pyproj")
+    group = places([[600000.0, 5400000.0, 7.5]] * 2, "EPSG:99999")
+    with pytest.raises(InputError, match="knows no coordinate system EPSG:99999"):
+        common_frame([group])
+    feet = places([[6000000.0, 2100000.0, 7.5]] * 2, "EPSG:2227")
+    assert common_frame([feet])[1].description.endswith("(EPSG:2227, US survey foot)")
+
+
 @pytest.mark.parametrize(
     ("coordinates", "system", "words"),
     [

@@ -13,13 +13,15 @@ from groma.localization.line_matching import SeenLines, lines_near
 from groma.localization.map_index import MapIndex
 from groma.localization.matching import MATCHES, alike_elsewhere, lengths_of, match_descriptors, pairs_near
 
+pytestmark = pytest.mark.kernels
+
 
 def _vectors(rng, count, size=32):
     values = rng.normal(size=(count, size)).astype(np.float32)
     return values / np.linalg.norm(values, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize(("rows", "columns"), [(300, 5000), (70, 30), (1, 50)])
+@pytest.mark.parametrize(("rows", "columns"), [pytest.param(300, 5000, marks=pytest.mark.compiled), (70, 30), (1, 50)])
 def test_matches_are_the_best_of_both_and_clear(rows, columns):
     rng = np.random.default_rng(rows)
     first, second = _vectors(rng, rows), _vectors(rng, columns)

@@ -13,7 +13,7 @@ def model():
     return holistic(4, seed=0).start.points_only()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def corner(tmp_path_factory):
     """A folder with the photographs of a house corner, and their model."""
     folder = tmp_path_factory.mktemp("corner") / "images"

@@ -13,7 +13,7 @@ import threading
 import time
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import nullcontext
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -138,13 +138,18 @@ def test_lines_mapped_by_dask():
         same_lines_as_alone(client.get_executor())
 
 
-def same_lines_as_alone(workers):
-    """Compare all that mapping says of a small wireframe."""
+@cache
+def mapped_alone():
+    """A small wireframe, and what one thread maps."""
     rng = np.random.default_rng(4)
     world = wireframe(arc(5), random_lines(40, rng), rng)
-    alone, found = None, None
     with work_with(1):
-        alone = map_lines(world.scene, world.segments, None, MapLinesOptions())
+        return world, map_lines(world.scene, world.segments, None, MapLinesOptions())
+
+
+def same_lines_as_alone(workers):
+    """Compare all that mapping says."""
+    world, alone = mapped_alone()
     with workers as chosen:
         assert isinstance(chosen, int | Executor)
         with work_with(chosen):

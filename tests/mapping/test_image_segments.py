@@ -31,6 +31,7 @@ def test_a_lens_that_bends_nothing_is_left_alone():
     assert straightener([1e-2])[0] is not None
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(
     ("name", "extra"),
     [
@@ -67,6 +68,7 @@ def test_end_points_come_back_to_the_image(name, extra):
     np.testing.assert_allclose(np.column_stack([back[2].reshape(2, 2), [1, 1]]) @ line / 1800.0, 0.0, atol=1e-6)
 
 
+@pytest.mark.compiled
 def test_bent_lines_are_found_whole(tmp_path):
     """Segments of a bent photograph: longer in all, and as close to the true lines as those of a lens without bend."""
     total = {}

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import erf
 
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.io.archive import read_archive, write_archive
@@ -15,9 +16,11 @@ from groma.mapping.lines.confidence import (
     line_accuracy,
     line_confidence,
     line_evidence,
+    usual_distance,
     with_confidence,
 )
 from groma.mapping.map import MapOptions
+from groma.mapping.noise.landmarks import line_noise
 from groma.scene import Cameras, LineObservations, Lines, Scene, Similarity
 
 FOCAL = 500.0
@@ -84,17 +87,30 @@ def test_evidence_has_no_unit_and_no_frame(scene):
     np.testing.assert_allclose(line_evidence(moved), line_evidence(scene), atol=2e-3)  # a weak prior has a unit
 
 
-def test_accuracy_is_the_share_of_repetitions_that_are_within_the_tolerance():
+def test_accuracy_is_the_share_of_repetitions_of_which_half_is_within_the_tolerance():
     ends, centers = [[[0.0, -1, 10], [0, 1, 10]]], np.column_stack([np.linspace(-2, 2, 7), np.zeros((7, 2))])
     gates, x, stated, within = replace(GATES, edge_px=1e9), centers[:, 0], [], []
     for seed in range(150):  # upright lines: each end alone is x = f (X - c) / Z, solved for (X / Z, 1 / Z)
         scene = scene_of(ends, centers, noise=0.8, seed=seed)
-        stated.append(line_accuracy(scene, gates)[0])
-        u = scene.line_observations.segment[:, 0] - 500.0
-        b = np.linalg.lstsq(np.column_stack([np.ones(7), -x]), u / FOCAL, rcond=None)[0][1]
-        within.append(abs(1.0 / b - 10.0) < gates.tolerance * 10.0)
+        stated.append(line_accuracy(scene, gates=gates)[0])
+        u = scene.line_observations.segment[:, [0, 2]] - 500.0
+        depth = 1.0 / np.linalg.lstsq(np.column_stack([np.ones(7), -x]), u / FOCAL, rcond=None)[0][1]
+        along = np.interp(np.linspace(0.0, 1.0, 99), [0.0, 1.0], depth)
+        within.append(np.median(np.abs(along - 10.0)) < gates.tolerance * 10.0)
     assert 0.2 < np.mean(within) < 0.8
     assert np.mean(stated) == pytest.approx(np.mean(within), abs=0.12)  # three deviations of 150 draws
+
+
+def test_half_of_a_line_decides_though_one_end_is_uncertain():
+    # Observed from -1 to 1; the farther from there, the less is known, so that half of -1 .. 7 is known as at 3.
+    centers = np.column_stack([np.linspace(-2, 2, 6), np.zeros((6, 2))])
+    gates, scene = replace(GATES, edge_px=1e9), scene_of([[[0.0, -1, 10], [0, 1, 10]]], centers)
+    longer = scene.replace(lines=Lines.through([[[0.0, -1, 10], [0, 7, 10]]]))
+    noise, middle = line_noise(longer), np.array([0.5])
+    deviation = np.sqrt(np.linalg.eigvalsh(noise.at(middle, middle, np.array([0])))[0, 1]) * max(noise.misfit[0], 1.0)
+    expected = erf(gates.tolerance * usual_distance(longer) / (np.sqrt(2.0) * deviation))
+    assert line_accuracy(longer, gates=gates)[0] == pytest.approx(expected)
+    assert expected < 0.8 * line_accuracy(scene, gates=gates)[0]
 
 
 def test_contours_of_a_pillar_are_no_edges():

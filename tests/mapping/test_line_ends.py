@@ -10,8 +10,6 @@ from groma.features.segments import Segments
 from groma.geometry import quaternion
 from groma.mapping.lines.build import LineMap, MapLinesOptions, Outcome, map_lines
 
-pytestmark = pytest.mark.kernels
-
 
 def flipped(world: Wireframe, images: range) -> list[Segments]:
     """The world's segments, those of some images run the other way."""
@@ -132,6 +130,7 @@ def seen_in_pieces(world: Wireframe, rng: np.random.Generator) -> list[Segments]
     return segments
 
 
+@pytest.mark.kernels
 def test_a_line_that_most_images_see_in_pieces_keeps_its_length():
     rng = np.random.default_rng(27)
     world = wireframe(arc(12), random_lines(12, rng), rng)

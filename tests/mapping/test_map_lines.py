@@ -45,6 +45,7 @@ def mapped(world: Wireframe) -> LineMap:
     return map_lines(world.scene, world.segments)
 
 
+@pytest.mark.compiled
 def test_wireframe_is_found(world, mapped):
     owner = true_lines(world, mapped)
     num_seen = sum(np.bincount(t[t >= 0], minlength=len(world.lines)) for t in world.truth)
@@ -93,6 +94,7 @@ def test_lines_run_like_their_segments(world, mapped):
         assert (mapped.segments[n, 1] - mapped.segments[n, 0]) @ true > 0
 
 
+@pytest.mark.compiled
 def test_another_world_frame_changes_nothing(world, mapped):
     turn = np.array([0.3, -0.2, 0.4, 0.0])
     turn[3] = np.sqrt(1 - turn @ turn)
@@ -132,6 +134,7 @@ def test_matches_of_a_file(world, mapped):
         external_matches(world.scene, world.segments, wrong)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("matcher", ["wide_baseline", "flow"])
 def test_matches_from_images(matcher):
     """A tiled floor seen from a camera that moves sideways: the matches are the same edges."""
@@ -159,6 +162,7 @@ def test_matches_from_images(matcher):
         segment_matches(scene, segments[:2], lambda k: images[k], matcher)
 
 
+@pytest.mark.compiled
 def test_lines_that_only_short_segments_show(world):
     short = map_lines(world.scene, world.segments, options=MapLinesOptions(min_longest=1e4))
     assert short.num_lines == 0
@@ -208,6 +212,7 @@ def test_directions_place_what_two_views_cannot():
         assert np.linalg.norm(np.cross(ends - a, d), axis=1).max() < 0.05
 
 
+@pytest.mark.compiled
 def test_distorted_camera():
     rng = np.random.default_rng(3)
     params = (700.0, 700.0, 400.0, 300.0, -0.12, 0.03, 0.001, -0.001)
@@ -291,12 +296,14 @@ def test_inputs_are_checked(world):
         map_lines(world.scene, world.segments, lambda i, j: wrong)
 
 
+@pytest.mark.compiled
 def test_nothing_is_changed(world):
     before = [s.ends.copy() for s in world.segments]
     map_lines(world.scene, world.segments)
     assert all(np.array_equal(a, s.ends) for a, s in zip(before, world.segments, strict=True))
 
 
+@pytest.mark.compiled
 def test_lines_of_texture():
     rng = np.random.default_rng(21)
     world = wireframe(arc(6), random_lines(30, rng), rng, num_clutter=80)

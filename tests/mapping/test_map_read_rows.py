@@ -2,12 +2,14 @@
 """Photographs rendered row by row while the camera moves: mapped with their motions, and without."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from _facade import FOCAL, HEIGHT, WALLS, WIDTH, facade
 
-from groma.adjustment.rolling_shutter import with_rolling_shutter
+from groma.adjustment.adjust import AdjustOptions, adjust
+from groma.adjustment.rolling_shutter import NOT_ROLLING, with_rolling_shutter
 from groma.cameras import model
 from groma.cli.main import run
 from groma.errors import InputError
@@ -15,8 +17,8 @@ from groma.evaluation import evaluate_poses
 from groma.features.segments import Segments
 from groma.geometry import quaternion
 from groma.io import read_scene
-from groma.mapping.map import MapOptions, map_images
-from groma.mapping.read_rows import as_measured, read_by_rows, taken_at_once
+from groma.mapping.map import MapOptions, MapResult, map_images
+from groma.mapping.read_rows import as_measured, mapped_as_measured, read_by_rows, taken_at_once
 
 COUNT = 7
 
@@ -87,6 +89,16 @@ def test_what_was_measured_comes_back(rendered):
     assert not np.allclose(once.segments[0].ends, segments[0].ends)
     still = taken_at_once(truth, segments)
     assert still.scene is truth and still.segments[0] is segments[0]
+
+
+def test_motions_that_were_left_out_are_told_where_they_were_asked_for(rendered):
+    _, truth, _ = rendered
+    still = taken_at_once(truth, [])
+    asked = SimpleNamespace(options=MapOptions(rolling_shutter="rows"))
+    adjusted = adjust(truth, AdjustOptions(max_iterations=0))
+    plain = MapResult(truth, truth, truth, truth, adjusted.report, AdjustOptions(), {}, "", {}, ())
+    assert mapped_as_measured(plain, still, asked).warnings == (NOT_ROLLING,)
+    assert mapped_as_measured(plain, still, SimpleNamespace(options=MapOptions())) is plain
 
 
 def test_what_images_cannot_do_is_refused(rendered, tmp_path):

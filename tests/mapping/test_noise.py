@@ -47,11 +47,13 @@ def varied(rng, count):
     return NOISE * np.exp(rng.normal(0.0, 0.7, count))
 
 
+@pytest.mark.compiled
 def test_size_of_the_noise():
     _, start, _ = scene_with(lambda rng, count: np.full(count, NOISE))
     assert noise_px(adjusted(start), "points") == pytest.approx(NOISE, rel=0.05)
 
 
+@pytest.mark.compiled
 def test_noise_of_one_size_is_left_alone():
     _, start, _ = scene_with(lambda rng, count: np.full(count, NOISE))
     own = with_point_noise(adjusted(start)).point_observations.sigma
@@ -59,6 +61,7 @@ def test_noise_of_one_size_is_left_alone():
     assert np.std(np.log(own)) < 0.1
 
 
+@pytest.mark.compiled
 def test_noise_of_each_point_is_found():
     _, start, size = scene_with(varied, wrong=0.02)
     scene = with_point_noise(adjusted(start))
@@ -70,6 +73,7 @@ def test_noise_of_each_point_is_found():
     assert 0.35 < np.std(np.log(own)) < 0.8
 
 
+@pytest.mark.compiled
 def test_weights_by_it_bring_the_cameras_nearer():
     plain, weighted = [], []
     for seed in range(4):
@@ -81,6 +85,7 @@ def test_weights_by_it_bring_the_cameras_nearer():
     assert np.mean(weighted) < 0.85 * np.mean(plain)
 
 
+@pytest.mark.compiled
 def test_given_deviations_are_kept_in_proportion():
     _, start, _ = scene_with(lambda rng, count: np.full(count, NOISE))
     table = start.point_observations

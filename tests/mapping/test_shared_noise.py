@@ -46,12 +46,14 @@ def adjusted(scene: Scene) -> Scene:
     return groma.adjust(scene, groma.AdjustOptions(loss="none", point_sigma_px=NOISE)).scene
 
 
+@pytest.mark.compiled
 def test_independent_errors_leave_every_observation_its_weight():
     scene = adjusted(crowded(0, 0.0)[1])
     found = with_shared_noise(scene, NOISE, NOISE)
     np.testing.assert_array_equal(found.point_observations.sigma, scene.point_observations.sigma)
 
 
+@pytest.mark.compiled
 def test_a_crowd_that_shares_errors_weighs_less():
     scene = adjusted(crowded(0, 0.2)[1])
     factor = with_shared_noise(scene, NOISE, NOISE).point_observations.sigma
@@ -60,6 +62,7 @@ def test_a_crowd_that_shares_errors_weighs_less():
     assert np.median(factor[crowd]) > 1.5 * np.median(factor[~crowd])
 
 
+@pytest.mark.compiled
 def test_cameras_come_nearer_for_it():
     plain, weighed = [], []
     for seed in range(4):
@@ -70,6 +73,7 @@ def test_cameras_come_nearer_for_it():
     assert np.mean(np.log(weighed)) < np.mean(np.log(plain)) - 0.1
 
 
+@pytest.mark.compiled
 def test_a_spot_that_is_found_twice_shares_the_weight_of_one():
     scene = adjusted(crowded(0, 0.0)[1])
     table = scene.point_observations

@@ -15,8 +15,6 @@ from groma.mapping.structure.find import StructureOptions, find_structure
 from groma.mapping.structure.flatness import plane_noise_px, surface_noise_px
 from groma.scene import Directions, Planes, Relations, synthetic
 
-pytestmark = pytest.mark.kernels
-
 NOISE = 0.15
 OPTIONS = StructureOptions(surface_sigma_px=0.5)
 HELD = groma.AdjustOptions(refine_poses=False, loss="none", point_sigma_px=NOISE, line_sigma_px=NOISE)

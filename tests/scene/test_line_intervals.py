@@ -58,6 +58,12 @@ def test_places_seen_for_a_pixel_or_two_are_none():
     np.testing.assert_allclose(found(*chance), [[0, 0.5], [0.9, 1]])
 
 
+def seen_from(center, ends):
+    """Segment (4,) of a camera that looks along z."""
+    at = ends - center
+    return (FOCAL * at[:, :2] / at[:, 2:] + 500.0).ravel()
+
+
 @pytest.fixture
 def gapped():
     """A line of length 10 with a gap from 3 to 6, and one without; four cameras that look at them."""
@@ -67,10 +73,10 @@ def gapped():
     image, line, segment = [], [], []
     for k, center in enumerate(places.T):
         for number, begin, end in shown:
-            at = ends[number, :1] + np.array([[begin], [end]]) * (ends[number, 1] - ends[number, 0]) - center
             image.append(k)
             line.append(number)
-            segment.append((FOCAL * at[:, :2] / at[:, 2:] + 500.0).ravel())
+            at = ends[number, :1] + np.array([[begin], [end]]) * (ends[number, 1] - ends[number, 0])
+            segment.append(seen_from(center, at))
     poses = np.column_stack([np.tile([0.0, 0, 0, 1], (4, 1)), -places.T])
     return Scene.from_images(
         Cameras(ids=[1], models=("PINHOLE",), params=[[FOCAL, FOCAL, 500, 500]], width=[1000], height=[1000]),
@@ -107,6 +113,27 @@ def test_ends_that_no_two_images_show_go(gapped):
     scene = with_supported_intervals(gapped.replace(lines=gapped.lines.replace(segments=longer)))
     np.testing.assert_allclose(scene.lines.segments, gapped.lines.segments, atol=1e-9)
     assert len(scene.line_intervals) == 2
+
+
+@pytest.mark.parametrize("images", [1, 4])
+def test_where_an_edge_lies_beside_its_line_nothing_is_supported(gapped, images):
+    # From 0.6 on the edge bends away, by 4 pixels at its end. What one image of four shows there is noise.
+    first, last = gapped.lines.segments[1]
+    bend, away = first + 0.6 * (last - first), last + np.array([0.0, 0.1, 0.0])
+    seen, rows = gapped.line_observations, [1] * 4
+    centers = gapped.cam_centers_in_world
+    straight = [seen_from(center, np.array([first, bend])) for center in centers]
+    bent = [seen_from(c, np.array([bend, away if k < images else last])) for k, c in enumerate(centers)]
+    more = LineObservations([*range(4), *range(4)], rows * 2, [*straight, *bent])
+    kept = seen.take(seen.line_idx == 0)
+    columns = {
+        name: np.concatenate([getattr(kept, name), getattr(more, name)])
+        for name in ("image_idx", "line_idx", "segment")
+    }
+    scene = with_supported_intervals(gapped.replace(line_observations=LineObservations(**columns)))
+    reached = (scene.lines.segments[1] - first) @ (last - first) / ((last - first) @ (last - first))
+    np.testing.assert_allclose(reached, [0.0, 1.0 if images == 1 else 0.75], atol=0.06)
+    np.testing.assert_allclose(line_pieces(scene)[0][:2, :, 0], [[0, 3], [6, 10]], atol=1e-9)
 
 
 def test_one_line_per_interval(gapped):

@@ -38,6 +38,7 @@ def _with_noise(problem, seed, common):
     return Problem(problem.variables, [noisy])
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("common", [0.0, 0.6])
 def test_clusters_tell_the_scatter_of_solutions(common):
     """Normalised errors of the third pose over 60 draws; to take alike errors for independent ones is wrong."""

@@ -89,6 +89,7 @@ def assert_blocks(covariances, expected, columns, tolerance=1e-6):
             )
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(
     "case",
     [{}, {"num_lines": 8}, {"num_lines": 8, "num_planes": 1}, {"shared_intrinsics": True, "num_points": 60},
@@ -100,6 +101,7 @@ def test_equals_inverse_of_full_matrix(case):
     assert_blocks(Covariances(problem), *full_covariance(problem))
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("line_chart", ["cartesian", "orthonormal_right", "free_left"])
 def test_every_kind_together(line_chart):
     problem = solve(held(structured(line_chart=line_chart)), EXACT).problem
@@ -199,6 +201,7 @@ def test_structure_only():
     assert_blocks(Covariances(problem), expected, {"points": columns["points"]}, 1e-8)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(("group", "charts"), [("lines", LINE_CHARTS), ("planes", PLANE_CHARTS)])
 def test_covariances_are_carried_between_charts(group, charts):
     problem = solve(held(structured()), EXACT).problem
@@ -214,6 +217,7 @@ def test_covariances_are_carried_between_charts(group, charts):
         np.testing.assert_allclose(back, covariances.of(group), atol=1e-7 * np.abs(back).max(), err_msg=name)
 
 
+@pytest.mark.compiled
 def test_derived_quantities_follow_the_estimate():
     """The analytic way: J Sigma J^T with the Jacobian written by hand."""
     problem = solve(held(structured()), EXACT).problem
@@ -250,6 +254,7 @@ def test_derived_quantities_follow_the_estimate():
         quantities.angle_between_lines(covariances, ("points", 0), ("lines", 1))
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("num_cameras", [3, 14, 60])
 def test_fronts_equal_the_dense_inverse(num_cameras):
     """Random symmetric positive blocks on the pattern of a chain with loop closures."""

@@ -123,6 +123,7 @@ def test_whatever_is_eliminated_the_step_is_the_dense_one(eliminate):
         np.testing.assert_allclose(got[name], expected[name], atol=1e-8 * np.abs(expected[name]).max())
 
 
+@pytest.mark.compiled
 def test_threads_do_not_change_the_step(monkeypatch):
     """To the last digit: how the sums are divided depends on the problem alone."""
     monkeypatch.setattr(parallel, "FACTORS_FOR_THREADS", 0)

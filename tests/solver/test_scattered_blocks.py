@@ -15,8 +15,6 @@ from groma.solver.options import SolverOptions
 from groma.solver.reduce.alone import Alone
 from groma.solver.reduce.shards import solve_shards
 
-pytestmark = pytest.mark.kernels
-
 
 class Counting(Alone):
     """One process that remembers how much it sums."""

@@ -58,6 +58,7 @@ def part(factor, rows, number):
 
 
 # Private principal points are hardly determined here; conjugate gradients need hundreds of steps, in shards or not.
+@pytest.mark.compiled
 @pytest.mark.parametrize(
     ("shared_intrinsics", "linear_solver"),
     [(None, "dense"), (None, "pcg"), (True, "sparse"), (True, "pcg"), (False, "dense"), (False, "sparse")],
@@ -78,6 +79,7 @@ def test_reaches_the_minimum_of_the_whole(shared_intrinsics, linear_solver):
         np.testing.assert_allclose(again.report.initial_cost, parts.report.final_cost, rtol=1e-12)
 
 
+@pytest.mark.compiled
 def test_cuts_make_no_difference_to_a_step():
     problem = scene_problem(num_cameras=6, num_points=60, num_lines=20, shared_intrinsics=False)
     one_step = SolverOptions(max_iterations=1, linear_solver="dense", threads=1)
@@ -98,6 +100,7 @@ def test_the_step_is_that_of_a_solve_at_once():
         np.testing.assert_allclose(getattr(parts.report.history[0], key), expected, rtol=1e-6)
 
 
+@pytest.mark.compiled
 def test_refused_steps_are_undone():
     problem = scene_problem(num_cameras=6, num_points=60, disturb=0.6)
     report = solve_shards(
@@ -153,6 +156,7 @@ def test_says_what_is_wrong_with_shards():
         solve_shards(problem.variables, [Shard({"trees": slice(0, 1)}, list)])
 
 
+@pytest.mark.compiled
 def test_steps_are_longer_under_a_robust_loss(monkeypatch):
     """Reweighted least squares overestimates the curvature; a step learns that from the one before."""
     problem = scene_problem(num_cameras=6, num_points=80, loss=Cauchy(1.0))
@@ -217,6 +221,7 @@ def of_process(problem, shards):
     return variables, [Shard(rows, shard.factors) for rows, shard in zip(own, shards, strict=True)]
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("linear_solver", ["dense", "pcg"])
 @pytest.mark.parametrize("count", [2, 5])
 def test_processes_with_shards_of_their_own_find_the_same_bits(count, linear_solver):
@@ -254,6 +259,7 @@ class Diary:
         self.kept.append(({name: state.copy() for name, state in states.items()}, waypoint))
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("room", [0.0, 1e9])
 def test_goes_on_where_it_stood(room):
     """From every accepted step on a solve comes to the same bits, whether shards stay in memory or not."""

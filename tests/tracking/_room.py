@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A room with painted walls, rendered by ray casting: grey images, depth, right images, and the true poses."""
 
+from functools import cache, lru_cache
+
 import cv2
 import numpy as np
 
@@ -17,6 +19,7 @@ def camera(baseline: float | None = None) -> SequenceCamera:
     return SequenceCamera("PINHOLE", np.array([FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]), WIDTH, HEIGHT, baseline)
 
 
+@cache
 def _paintings() -> np.ndarray:
     """Six walls (6, n, n): soft noise, and dark and bright rectangles with sharp edges."""
     rng = np.random.default_rng(7)
@@ -33,11 +36,15 @@ def _paintings() -> np.ndarray:
     return np.clip(walls, 5, 250)
 
 
-_WALLS = _paintings()
-
-
 def render(cam_from_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Grey image and depth of one camera."""
+    gray, depth = _rendered(np.asarray(cam_from_world, float).tobytes())
+    return gray.copy(), depth.copy()
+
+
+@lru_cache(256)  # tests of a file look from the same places
+def _rendered(pose: bytes) -> tuple[np.ndarray, np.ndarray]:
+    cam_from_world = np.frombuffer(pose)
     world = se3.inverse(cam_from_world[None])[0]
     R = quaternion.to_matrix(world[:4])
     v, u = np.mgrid[0:HEIGHT, 0:WIDTH]
@@ -55,7 +62,7 @@ def render(cam_from_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     gray = np.zeros(u.shape, np.float32)
     for wall in range(6):
         mine = (2 * axis + side) == wall
-        painted = cv2.remap(_WALLS[wall], s.astype(np.float32), t.astype(np.float32), cv2.INTER_LINEAR)
+        painted = cv2.remap(_paintings()[wall], s.astype(np.float32), t.astype(np.float32), cv2.INTER_LINEAR)
         gray[mine] = painted[mine]
     return np.round(gray).astype(np.uint8), depth.astype(np.float32)
 

@@ -53,6 +53,45 @@ def test_threads_and_frames_known_ahead_change_no_bit(kind):
         np.testing.assert_array_equal(other.scene.planes.hesse, alone.scene.planes.hesse)
 
 
+def test_a_frame_is_answered_while_the_map_is_at_work(monkeypatch):
+    frames = _room.frames("rgbd", _room.poses(3))
+    tracker = Tracker(_room.camera(), OPTIONS)
+    advance, may_go_on, done = tracker._mapper.advance, threading.Event(), []
+
+    def held_up(*given):
+        assert may_go_on.wait(60.0)
+        done.append(given)
+        return advance(*given)
+
+    monkeypatch.setattr(tracker._mapper, "advance", held_up)
+    assert tracker.process(frames[0]).pose is not None
+    assert not done
+    threading.Timer(0.05, may_go_on.set).start()
+    assert tracker.map.keyframes  # who asks for the map waits
+    assert len(done) == 1
+    tracker.process(frames[1])
+    assert tracker.process(frames[2]).pose is not None  # and so does the next frame
+    assert len(done) >= 2
+    tracker.finish()
+
+
+def test_an_error_behind_a_frame_is_raised_by_the_next(monkeypatch):
+    frames = _room.frames("rgbd", _room.poses(3))
+    tracker = Tracker(_room.camera(), OPTIONS)
+
+    def fail(*given):
+        raise ZeroDivisionError("behind")
+
+    monkeypatch.setattr(tracker._mapper, "advance", fail)
+    tracker.process(frames[0])
+    with pytest.raises(ZeroDivisionError, match="behind"):
+        tracker.process(frames[1])
+    tracker.process(frames[2])
+    result = tracker.finish()
+    assert len(result.trajectory) == 2
+    assert any("what followed the last frame" in warning and "behind" in warning for warning in result.warnings)
+
+
 def test_another_frame_than_the_one_announced_is_tracked_as_it_is():
     frames = _room.frames("rgbd", _room.poses(7))
     tracker = Tracker(_room.camera(), OPTIONS)

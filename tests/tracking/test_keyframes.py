@@ -59,6 +59,7 @@ def test_what_is_worked_out_is_taken_up_before_a_frame_is_searched():
     tracker = Tracker(_room.camera(), OPTIONS)
     for frame in _room.frames("rgbd", _room.poses(14)):
         tracker.process(frame)
+    assert tracker.map.keyframes  # what goes on behind the last frame is done
     mapper, present = tracker._mapper, tracker._present
     mapper.keep_present(present, Stopwatch())
     made = len(tracker.map.keyframes)

@@ -7,6 +7,8 @@ import pytest
 
 from groma.features.point_tracks import _alike, corners, follow, image_noise
 
+pytestmark = pytest.mark.kernels
+
 
 def _texture(seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)

@@ -18,6 +18,8 @@ from groma.tracking.frame.measurements import DEPTH_BASELINE, LineMeasurements, 
 from groma.tracking.map.landmarks import ALIVE, LineTable, MapView, PlaneTable, PointTable
 from groma.tracking.map.map_scene import TRACKING, SeenLines, SeenPlanes, SeenPoints, map_scene
 
+pytestmark = pytest.mark.kernels
+
 CAMERA = TrackCamera(500.0, 510.0, 320.0, 240.0, 640, 480, baseline=0.3)
 TRUE = se3.exp(np.array([[0.1, -0.05, 0.02, 0.05, -0.03, 0.04]]))[0]
 START = se3.compose(se3.exp(np.array([[0.03, 0.02, -0.02, 0.02, 0.01, -0.02]])), TRUE[None])[0]

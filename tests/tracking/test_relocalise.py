@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Parts of finding a pose: features paired near expected places, depths read, poses proposed among wrong matches."""
 
+import cv2
 import numpy as np
 import pytest
 
 from groma.features.depth.points import DEPTH_POINTS, depth_at
 from groma.geometry import se3
 from groma.tracking.frame.camera import TrackCamera, into
-from groma.tracking.pose.near_matches import pair_near
+from groma.tracking.frame.descriptor_pairs import pair_anywhere, pair_near
 from groma.tracking.pose.relocalise import pose_from_matches
 
 CAMERA = TrackCamera(525.0, 525.0, 320.0, 240.0, 640, 480)
@@ -36,7 +37,26 @@ def test_pairs_are_the_most_alike_for_both(radius):
     assert len(found) > 50
 
 
+def test_pairs_anywhere_are_those_of_opencv():
+    """Of 400 descriptors some are seen again with bits flipped, some twice, and some as often as by chance."""
+    rng = np.random.default_rng(2)
+    first = rng.integers(0, 256, (400, 32), dtype=np.uint8)
+    first[5] = first[6]
+    flips = np.packbits(rng.random((500, 256)) < rng.uniform(0.0, 0.35, (500, 1)), axis=1)
+    second = first[rng.integers(0, 300, 500)] ^ flips
+    second[::7] = first[5] ^ flips[0]  # as near to the same ones
+    for max_bits in (64, 100):
+        known = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(first, second)
+        wanted = [(pair.queryIdx, pair.trainIdx) for pair in known if pair.distance <= max_bits]
+        np.testing.assert_array_equal(np.column_stack(pair_anywhere(first, second, max_bits)), wanted)
+        assert len(wanted) > 100
+
+
 def test_nothing_pairs_with_nothing():
+    nobody = np.zeros((0, 32), np.uint8)
+    for both in ((nobody, nobody), (np.zeros((1, 32), np.uint8), nobody)):
+        for one, other in (both, both[::-1]):
+            assert [len(rows) for rows in pair_anywhere(one, other, 64)] == [0, 0]
     none, words = np.zeros((0, 2)), np.zeros((0, 32), np.uint8)
     assert pair_near(none, words, none, words, 10.0, 64).shape == (0, 2)
     one = np.array([[5.0, 5.0]]), np.zeros((1, 32), np.uint8)

@@ -4,13 +4,11 @@
 import base64
 import json
 import re
-import shutil
-import subprocess
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from _pages import data_of, write_page, write_pictures
+from _pages import data_of, write_page
 from _scene import exact_scene
 
 from groma.cli.main import run
@@ -290,22 +288,3 @@ def test_the_first_image_is_the_one_with_most_lines(tmp_path):
         {"photo": photo, "lines_seen": n, "points_seen": 0} for photo, n in (("", 9), ("data:", 2), ("data:", 3))
     ]
     assert _page_images._first(entries) == 2
-
-
-# ------------------------------------------------------------------------------------------------ Strangers' files
-
-
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs Chromium")
-def test_the_page_draws_in_a_browser_without_complaints(tmp_path):
-    write_pictures(tmp_path, "photos/first.jpg")
-    write_report(tmp_path / "page.html", None, exact_scene(("first.jpg", "second.jpg")), images=tmp_path / "photos")
-    finished = subprocess.run(
-        ["chromium", "--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-         "--enable-logging=stderr", "--v=0",
-         f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=3000", "--dump-dom",
-         f"file://{tmp_path / 'page.html'}"],
-        capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
-    assert "CONSOLE" not in finished.stderr
-    # The script has filled the list of images.
-    assert re.search(r"<select id=\"image\".*<option[^>]*>[^<]*first.jpg", finished.stdout, re.DOTALL)

@@ -113,6 +113,12 @@ def _click(page, place) -> None:
     page.mouse.click(*page.evaluate(WHERE, _in_page(page, place)))
 
 
+def test_the_page_lists_the_photographs(opened, scene):
+    """Its script has run."""
+    found = opened().locator("#image option").all_text_contents()
+    assert [name for name in scene.images.names if any(name in text for text in found)] == list(scene.images.names)
+
+
 def test_a_line_clicked_in_the_scene_lights_up_in_every_photograph(opened, scene):
     page = opened()
     assert page.evaluate(ORANGE, "photo") == page.evaluate(ORANGE, "scene") == 0

@@ -58,7 +58,7 @@ _SUFFIX = ".nbc"
 _PACKAGE = Path(__file__).parents[1]
 #: Folder of the package with functions that were compiled ahead; only in wheels for one platform.
 SHIPPED = "_compiled_ahead"
-_DIGEST, _CHECKSUM = 64, 8
+_DIGEST, _CHECKSUM = 64, 8  # letters and bytes that a file begins with (its format)
 
 
 @lru_cache(maxsize=1)

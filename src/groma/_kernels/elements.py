@@ -25,7 +25,7 @@ from groma._kernels.calls import CallWrapper, is_readable
 
 _WORD = llvm.IntType(64)
 _ZERO, _HALF = llvm.Constant(_WORD, 0), llvm.IntType(32)
-#: Places in an array's description.
+#: Places in an array's description (Numba's format).
 _DATA, _SHAPE, _STRIDES = 4, 5, 6
 
 

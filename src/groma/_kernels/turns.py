@@ -18,9 +18,9 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-#: Longest wait for a function that another process compiles, seconds; then it is compiled here, too.
-_PATIENCE = 120.0
-_PAUSE = 0.01
+#: Longest wait for a function that another process compiles, seconds, then it is compiled here, too; and between two
+#: looks (cost: time).
+_PATIENCE, _PAUSE = 120.0, 0.01
 #: One open file a folder, for as long as the process lives: to close it would give up all its locks.
 _files: dict[str, int] = {}
 

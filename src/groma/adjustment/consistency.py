@@ -52,6 +52,8 @@ KINDS = {
 BAND, LIMIT = 0.95, 0.999
 #: Runs of which the variance is taken to be that of all (cost: an inversion each).
 SAMPLED = 5
+#: Scenes that are drawn, and images of each (cost: time).
+RUNS, NUM_IMAGES = 100, 15
 
 
 @dataclass(frozen=True)
@@ -100,9 +102,9 @@ class ConsistencyReport:
 
 
 def consistency(
-    runs: int = 100,
+    runs: int = RUNS,
     seed: int = 0,
-    num_images: int = 15,
+    num_images: int = NUM_IMAGES,
     noise_px: float = 0.5,
     believed_px: float | None = None,
     gauges: tuple[str, ...] = ("held", "inner"),

@@ -11,7 +11,8 @@ each number that the images determine (its redundancy as a measurement),
 
 Expected is no motion; or, where the images prove to be a sequence, a share :math:`\lambda` of the motion d from the
 image before to the image after: :math:`e = \lambda d`, if it explains the motions better than chance would. Adjustment
-and estimate take turns.
+and estimate take turns. Motions that explain next to nothing would stand for errors of the calibration: they are left
+out, and the images count as taken at once.
 """
 
 from __future__ import annotations
@@ -36,6 +37,11 @@ from groma.scene import CameraMotions, Scene
 from groma.scene.motions import COLUMNS, ROWS
 from groma.solver.covariance.marginals import Covariances
 
+#: What is said where motions are left out.
+NOT_ROLLING = (
+    "The images show next to no rolling shutter: motions of the cameras explain less than a tenth of the residuals' "
+    "variance, and would stand for errors of the calibration. The images count as taken at once."
+)
 #: What an image may be read along.
 AXES = {"rows": ROWS, "columns": COLUMNS}
 
@@ -68,7 +74,7 @@ class RollingShutterGates:
         "convention: half of what would decide",
     )
     explained: float = gate(
-        0.1, "share", "of the residuals' variance that motions explain, below which it is told", "convention: a tenth"
+        0.1, "share", "of the residuals' variance that motions explain, or they are left out", "convention: a tenth"
     )
     determined: float = gate(
         0.5, "share", "of a motion that the images determine, below which it is told", "convention: half"
@@ -93,9 +99,13 @@ class Motions:
     spread: float
     #: Share of the residuals' variance that they explain, against images that were taken at once; None: not asked.
     explained: float | None = None
+    #: Whether they explain so little that the result is without them.
+    left_out: bool = False
 
     def sentences(self) -> tuple[str, ...]:
         """Say how the cameras moved."""
+        if self.left_out:
+            return ()
         shift, turn = (np.linalg.norm(part, axis=1) for part in (self.motion[:, :3], self.motion[:, 3:]))
         told = (
             f"Rolling shutter of {counted(len(shift), 'images')}: while one is read the camera moves by "
@@ -109,13 +119,9 @@ class Motions:
 
     def warnings(self, gates: RollingShutterGates = GATES) -> tuple[str, ...]:
         """Say where motions rest on what was expected of them."""
+        if self.left_out:
+            return (NOT_ROLLING,)
         told = []
-        if self.explained is not None and self.explained < gates.explained:
-            told.append(
-                f"The images show next to no rolling shutter: motions explain {max(self.explained, 0.0):.1%} of the "
-                "variance of the residuals. They may stand for errors of the calibration. Repeat without "
-                "--rolling-shutter."
-            )
         if self.spread < gates.parallel:
             told.append(
                 f"All images are read along nearly the same direction (within {np.degrees(self.spread):.0f} degrees). "
@@ -137,6 +143,7 @@ class Motions:
         shift, turn = (np.linalg.norm(part, axis=1) for part in (self.motion[:, :3], self.motion[:, 3:]))
         return {
             "num_images": len(shift),
+            "left_out": self.left_out,
             "shift": {"median": float(np.median(shift)), "largest": float(shift.max())},
             "turn_deg": {"median": float(np.degrees(np.median(turn))), "largest": float(np.degrees(turn.max()))},
             "expected_sigma": {"shift": self.sigma[0], "turn_deg": float(np.degrees(self.sigma[1]))},
@@ -152,7 +159,7 @@ class Motions:
 
 @dataclass(frozen=True, eq=False)
 class RollingShutterResult:
-    """An adjustment of images that were read row by row."""
+    """An adjustment of images that were read row by row; without motions where these are left out."""
 
     result: AdjustResult
     motions: Motions
@@ -215,7 +222,7 @@ def adjust_rolling_shutter(
         When the estimate has settled.
     """
     options = options or AdjustOptions()
-    still = noise_at_once(scene, options)
+    at_once = adjust(scene.replace(camera_motions=CameraMotions()), options, progress)
     start = scene.camera_motions.sigma[0, [0, 3]]
     quick = replace(options, check_lens=False)
     for _ in range(gates.max_rounds - 1):
@@ -228,15 +235,13 @@ def adjust_rolling_shutter(
             break
     result = adjust(scene, options, progress)
     found = motions_of(result.scene, result.problem, gates)
-    if still is not None and result.report.sigma0 is not None:
-        found = replace(found, explained=1.0 - (result.report.sigma0 / still) ** 2)
-    return RollingShutterResult(result, found)
-
-
-def noise_at_once(scene: Scene, options: AdjustOptions) -> float | None:
-    """Return the noise that the observations of a scene show if it is adjusted without motions; None if they do not."""
-    told = replace(options, check_lens=False)
-    return adjust(scene.replace(camera_motions=CameraMotions()), told).report.sigma0
+    still, rolling = at_once.report.sigma0, result.report.sigma0
+    if still is None or rolling is None:
+        return RollingShutterResult(result, found)
+    explained = 1.0 - (rolling / still) ** 2
+    if explained < gates.explained:
+        return RollingShutterResult(at_once, replace(found, explained=explained, left_out=True))
+    return RollingShutterResult(result, replace(found, explained=explained))
 
 
 def motions_of(scene: Scene, problem: Problem | None, gates: RollingShutterGates = GATES) -> Motions:

@@ -8,6 +8,7 @@ Both whiten their residuals; the formulas stand in :mod:`groma.estimators.direct
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -58,9 +59,20 @@ class Parallel:
     def of(cls, directions: FloatArray, covariance: FloatArray, sigma: FloatArray) -> Parallel:
         basis = np.stack(perpendicular(directions), axis=1)
         inner = basis @ covariance @ np.swapaxes(basis, 1, 2) + sigma[:, None, None] ** 2 * np.eye(2)
-        values, axes = np.linalg.eigh(inner)
-        scaled = np.swapaxes(axes, 1, 2) / np.sqrt(values)[..., None]
-        return cls(directions, scaled @ basis, np.sqrt(values.prod(axis=1)))
+        # Eigenvalues and axes of two by two numbers: a hundred times as fast as those of any matrix.
+        first, mixed, second = inner[:, 0, 0], inner[:, 0, 1], inner[:, 1, 1]
+        half = 0.5 * (first - second)
+        large = 0.5 * (first + second) + np.hypot(half, mixed)
+        small = (first * second - mixed**2) / large
+        turn = 0.5 * np.arctan2(mixed, half)
+        axes = np.stack([np.cos(turn), np.sin(turn), -np.sin(turn), np.cos(turn)], axis=1).reshape(-1, 2, 2)
+        scaled = axes / np.sqrt(np.stack([large, small], axis=1))[..., None]
+        return cls(directions, scaled @ basis, np.sqrt(large * small))
+
+    @cached_property
+    def products(self) -> FloatArray:
+        """Products (N, 9) of the whitened bases with themselves."""
+        return (np.swapaxes(self.whitened, 1, 2) @ self.whitened).reshape(-1, 9)
 
     def __len__(self) -> int:
         return len(self.area)

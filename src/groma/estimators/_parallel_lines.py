@@ -32,8 +32,12 @@ from scipy.special import gammaln
 
 from groma._typing import FloatArray, IntArray
 from groma.estimators._direction_features import Parallel
+from groma.execution import map_in_threads
 from groma.gates import gate
 from groma.geometry.algebra import perpendicular, unit
+
+#: Guesses looked at by one piece of work (cost: memory).
+_AT_ONCE = 16
 
 
 @dataclass(frozen=True)
@@ -128,7 +132,7 @@ def parallel_lines(
     px = np.zeros(1) if turned is None else np.concatenate([[gates.start_px, 0.0], gates.deviations])
     turned = np.zeros(len(directions)) if turned is None else turned
     noise = [(angle, one) for angle in np.geomspace(gates.looser * sigma, sigma, gates.angles) for one in px]
-    pools = [Parallel.of(directions, covariance, np.hypot(angle, one * turned)) for angle, one in noise]
+    pools = map_in_threads(lambda one: Parallel.of(directions, covariance, np.hypot(one[0], one[1] * turned)), noise)
     guesses = directions[np.argsort(pools[0].area, kind="stable")[: gates.max_candidates]]
     guesses = np.concatenate([guesses, candidates])
     found = _search(pools[0], guesses, wanted, gates)
@@ -160,9 +164,10 @@ def parallel_lines(
 def _search(pool: Parallel, guesses: FloatArray, wanted: Acceptance, gates: ParallelGates) -> _Found:
     """Find the directions of lines among guesses (H, 3)."""
     found, share, evidence = np.zeros((0, 3)), np.zeros(0), []
+    members = _members(pool, guesses, gates)
     while len(found) < wanted.most and len(pool) >= max(wanted.least, 2):
         far = (np.abs(guesses @ found.T) < math.cos(wanted.apart)).all(axis=1)
-        best = _best(pool, guesses[far], (found, share), wanted, gates)
+        best = _best(pool, (guesses[far], members[far]), (found, share), wanted, gates)
         if best is None:
             break
         direction, part, factor = best
@@ -178,8 +183,18 @@ def _most_likely(pools: list[Parallel], found: _Found, gates: ParallelGates) -> 
     """Which of several pools of the same lines, with other noise, is the likeliest with these directions."""
     none = 1.0 - found.probability.sum(axis=0, keepdims=True)
     share = np.maximum(np.concatenate([found.probability, none]).mean(axis=1, keepdims=True), 1e-12)
-    parts = (np.vstack([_members(pool, found.vectors, gates), _anywhere(pool)]) for pool in pools)
-    return int(np.argmax([np.logaddexp.reduce(np.log(share) + part, axis=0).sum() for part in parts]))
+
+    def likelihood(pool: Parallel) -> float:
+        parts = np.vstack([_members(pool, found.vectors, gates), _anywhere(pool)])
+        return float(_log_sum(np.log(share) + parts).sum())
+
+    return int(np.argmax(map_in_threads(likelihood, pools)))
+
+
+def _log_sum(logarithms: FloatArray) -> FloatArray:
+    """Logarithm (N,) of the sum of what (D, N) are the logarithms of."""
+    largest = logarithms.max(axis=0)
+    return largest + np.log(np.exp(logarithms - largest).sum(axis=0))
 
 
 def _anywhere(pool: Parallel) -> FloatArray:
@@ -211,20 +226,30 @@ def _across(pool: Parallel, vectors: FloatArray, gates: ParallelGates) -> FloatA
 
 def _best(
     pool: Parallel,
-    guesses: FloatArray,
+    guessed: tuple[FloatArray, FloatArray],
     found: tuple[FloatArray, FloatArray],
     wanted: Acceptance,
     gates: ParallelGates,
 ) -> tuple[FloatArray, float, float] | None:
-    """Direction, share of the lines and evidence of the best new direction; None if none is one."""
-    vectors, share = found
+    """Direction, share of the lines and evidence of the best new direction; None if none is one.
+
+    Guesses (H, 3) come with the densities (H, N) of lines along them.
+    """
+    (vectors, share), (guesses, members) = found, guessed
     log_share = np.log(np.append(share, max(1.0 - share.sum(), 1e-12)))[:, None]
-    before = np.logaddexp.reduce(log_share + np.vstack([_members(pool, vectors, gates), _anywhere(pool)]), axis=0)
-    ratio = np.exp(np.minimum(_members(pool, guesses, gates) - before, 600.0))
-    part = np.full((len(guesses), 1), 3.0 / len(pool))
-    for _ in range(4):
-        part = (part * ratio / (1.0 - part + part * ratio)).mean(axis=1, keepdims=True)
-    gain = np.log1p(part * (ratio - 1.0)).sum(axis=1)
+    before = _log_sum(log_share + np.vstack([_members(pool, vectors, gates), _anywhere(pool)]))
+
+    def gains(rows: slice) -> tuple[FloatArray, FloatArray]:
+        ratio = np.exp(np.minimum(members[rows] - before, 600.0))
+        part = np.full((len(ratio), 1), 3.0 / len(pool))
+        for _ in range(4):
+            told = part * ratio
+            part = (told / (1.0 - part + told)).mean(axis=1, keepdims=True)
+        return part, np.log1p(part * (ratio - 1.0)).sum(axis=1)
+
+    rows = [slice(first, first + _AT_ONCE) for first in range(0, len(guesses), _AT_ONCE)]
+    parts, sums = zip(*map_in_threads(gains, rows), strict=True) if rows else ((np.zeros((0, 1)),), (np.zeros(0),))
+    part, gain = np.concatenate(parts), np.concatenate(sums)
     best, tried = None, np.zeros((0, 3))
     for k in np.argsort(-gain, kind="stable"):
         if len(tried) == gates.max_refined:
@@ -250,7 +275,7 @@ def _refined(
         density = np.logaddexp(math.log1p(-part) + before, member)
         mine = np.exp(member - density)
         weight = mine * (gates.freedom + 2.0) / (gates.freedom + pool.squared(direction[None])[0])
-        direction = _mean(pool, weight, direction)
+        direction = _mean(pool, weight[None], direction[None])[0]
         part = float(np.clip(mine.mean(), 1e-12, 1.0 - 1e-12))
     variance = np.linalg.eigvalsh(_covariance(pool, weight, direction))[1:]
     evidence = float((density - before).sum() + 0.5 * np.log(variance).sum())
@@ -272,18 +297,19 @@ def _settled(
         if with_more:
             parts += [_nearly(pool, vectors, gates), _across(pool, vectors, gates)]
         mixed = np.log(np.maximum(shares, 1e-300))[:, None] + np.vstack(parts)
-        probability = np.exp(mixed - np.logaddexp.reduce(mixed, axis=0))
+        probability = np.exp(mixed - mixed.max(axis=0))
+        probability /= probability.sum(axis=0)
         shares, mine, squared = probability.mean(axis=1), probability[:num], pool.squared(vectors)
         weight = mine * (gates.freedom + 2.0) / (gates.freedom + squared)
-        vectors = np.array([_mean(pool, *one) for one in zip(weight, vectors, strict=True)])
+        vectors = _mean(pool, weight, vectors)
     return vectors, shares[:num], mine, squared
 
 
 def _mean(pool: Parallel, weight: FloatArray, start: FloatArray) -> FloatArray:
-    """The direction of least squares, on the side of the start."""
-    information = np.einsum("n,nai,naj->ij", weight, pool.whitened, pool.whitened)
-    direction = np.linalg.eigh(information)[1][:, 0]
-    return unit(direction if direction @ start > 0.0 else -direction)
+    """The directions (D, 3) of least squares with some weights (D, N), on the side of the starts."""
+    information = (weight @ pool.products).reshape(-1, 3, 3)
+    direction = np.linalg.eigh(information)[1][:, :, 0]
+    return unit(np.where(np.einsum("di,di->d", direction, start)[:, None] > 0.0, direction, -direction))
 
 
 def _covariance(pool: Parallel, weight: FloatArray, direction: FloatArray) -> FloatArray:

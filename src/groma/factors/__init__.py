@@ -48,26 +48,24 @@ from groma.factors.priors.pose_prior import PosePrior
 from groma.factors.priors.position_prior import PositionPrior
 from groma.factors.priors.similarity_between import SimilarityBetween
 from groma.factors.priors.vector_prior import VectorPrior
-from groma.factors.relations.line_direction import LineDirection
+from groma.factors.relations.direction_pairs import (
+    LineDirection,
+    LineParallelToPlane,
+    LinePerpendicularToDirection,
+    LinePerpendicularToPlane,
+    OrthogonalDirections,
+    OrthogonalLines,
+    OrthogonalPlanes,
+    ParallelDirections,
+    ParallelLines,
+    ParallelPlanes,
+    PlaneParallelToDirection,
+    PlanePerpendicularToDirection,
+)
 from groma.factors.relations.line_on_plane import LineOnPlane, SegmentOnPlane
 from groma.factors.relations.line_to_pixel import LineToPixel
 from groma.factors.relations.lines_meeting import LinesMeeting
 from groma.factors.relations.on_plane_pixels import PointOnPlanePixels, SegmentOnPlanePixels
-from groma.factors.relations.orthogonal import (
-    LineParallelToPlane,
-    LinePerpendicularToDirection,
-    OrthogonalDirections,
-    OrthogonalLines,
-    OrthogonalPlanes,
-    PlaneParallelToDirection,
-)
-from groma.factors.relations.parallel import (
-    LinePerpendicularToPlane,
-    ParallelDirections,
-    ParallelLines,
-    ParallelPlanes,
-    PlanePerpendicularToDirection,
-)
 from groma.factors.relations.point_on_line import PointOnLine
 from groma.factors.relations.point_on_plane import PointOnPlane
 from groma.factors.relations.point_to_image_line import PointToImageLine

@@ -41,9 +41,9 @@ from groma.mapping.lines.neighbors import covisible_neighbors
 from groma.mapping.photographs import read_gray
 from groma.scene import Scene
 
-#: Of the layout of the file; another one is built anew.
+#: Of the format of the file; another one is built anew.
 _VERSION = 3
-#: Images that the features of an image are matched with.
+#: Images that the features of an image are matched with (cost: time).
 _NEIGHBORS = 12
 
 #: What a damaged file of arrays raises.

@@ -26,7 +26,7 @@ from groma.localization.triangulation import triangulate_features
 from groma.mapping.photographs import read_gray
 from groma.scene import Keypoints, PointObservations, Points, Scene
 
-#: Images that the features of an image are matched with.
+#: Images that the features of an image are matched with (cost: time).
 _NEIGHBORS = 12
 #: Features of two kinds at one place, pixels.
 _SAME_PLACE = 1.0

@@ -142,6 +142,8 @@ class MapOptions:
     refine_rigs: bool = False
     #: What photographs were read along, ``rows`` or ``columns``; None: taken at once, unless a given model says how.
     rolling_shutter: str | None = None
+    #: Leave measurements in that the test for gross errors would take out.
+    keep_suspects: bool = False
 
     def point_model(self, threads: bool = True) -> PointModelOptions:
         """How points are reconstructed, with or without the number of threads, on which no result depends."""

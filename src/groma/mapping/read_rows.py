@@ -19,7 +19,13 @@ from scipy.spatial import KDTree
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult
-from groma.adjustment.rolling_shutter import AXES, adjust_rolling_shutter, motions_of, with_rolling_shutter
+from groma.adjustment.rolling_shutter import (
+    AXES,
+    NOT_ROLLING,
+    adjust_rolling_shutter,
+    motions_of,
+    with_rolling_shutter,
+)
 from groma.adjustment.terms.readout import motion_of, offsets_of
 from groma.cameras import model as camera_model
 from groma.errors import InputError
@@ -29,7 +35,6 @@ from groma.geometry import quaternion
 from groma.geometry.algebra import unit
 from groma.mapping.checkpoint_files import ADJUSTED, SCENE
 from groma.mapping.checkpoints import Stages, stage
-from groma.mapping.noise.observations import noise_px
 from groma.mapping.result import MapResult
 from groma.scene import CameraMotions, Scene
 
@@ -79,7 +84,7 @@ def read_by_rows(scene: Scene, options: MapOptions, depth: object = None) -> boo
 
 @stage("rows", SCENE)
 def adjust_read_rows(start: Scene, options: MapOptions, say: Callable[[str, int, int], None]) -> Scene:
-    """A model whose poses, points and motions during the readout are adjusted with robust losses."""
+    """A model whose poses, points and motions during the readout, if there are some, are adjusted robustly."""
     told = AdjustOptions(
         refine_intrinsics=bool(options.refine_intrinsics),
         refine_rigs=options.refine_rigs,
@@ -136,13 +141,11 @@ def as_measured(scene: Scene, at_once: TakenAtOnce) -> Scene:
 def mapped_as_measured(result: MapResult, at_once: TakenAtOnce, stages: Stages[MapOptions]) -> MapResult:
     """Return the map adjusted with what was measured, and what is to be said of the motions."""
     if not len(at_once.points.camera_motions):
-        return result
+        asked = stages.options.rolling_shutter is not None
+        return replace(result, warnings=(*result.warnings, NOT_ROLLING)) if asked else result
     before = as_measured(result.scene, at_once)
     adjusted = stages.run(adjust_as_measured, before, result.adjusted_with)
     motions = motions_of(adjusted.scene, adjusted.problem)
-    still = adjust(at_once.points.replace(camera_motions=CameraMotions()), AdjustOptions(check_lens=False)).scene
-    noise = [noise_px(scene, "points") for scene in (still, at_once.points)]
-    motions = replace(motions, explained=1.0 - (noise[1] / noise[0]) ** 2)
     return replace(
         result,
         scene=adjusted.scene,

@@ -15,7 +15,7 @@ from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult, Progress
 from groma.adjustment.survey.attach import Survey, Surveyed, with_survey
 from groma.adjustment.survey.given_poses import given_poses_of
-from groma.adjustment.survey.gross_errors import without_gross_errors
+from groma.adjustment.survey.gross_errors import reliability_of, without_gross_errors
 from groma.adjustment.survey.records import Reliability
 from groma.gates import gate
 from groma.io.survey import WorldFrame
@@ -24,6 +24,7 @@ from groma.mapping.checkpoints import stage
 from groma.mapping.noise.observations import noise_px
 from groma.scene import Scene, Similarity
 from groma.scene.local_frame import usual_frame
+from groma.scene.survey import with_rejected
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,7 @@ def adjust_surveyed(
     survey: Survey | None = None,
     options: AdjustOptions | None = None,
     progress: Callable[[Progress], bool | None] | None = None,
+    keep_suspects: bool = False,
 ) -> SurveyedResult:
     """Bring a scene into the frame of measurements and adjust it with them.
 
@@ -80,12 +82,16 @@ def adjust_surveyed(
         As for :func:`groma.adjust`; ``point_sigma_px`` and ``line_sigma_px`` are estimated.
     progress : callable, optional
         As for :func:`groma.adjust`.
+    keep_suspects : bool, optional
+        Leave in what the test for gross errors would take out, and take back what it took out before.
 
     Raises
     ------
     InputError
         If measurements and scene do not fit together.
     """
+    if keep_suspects:
+        scene = with_rejected(scene, ())
     surveyed = (
         with_survey(scene, survey) if survey else Surveyed(scene, Similarity(), WorldFrame("the frame of the scene"))
     )
@@ -98,6 +104,8 @@ def adjust_surveyed(
             break
         chosen = better
         result = adjust(surveyed.scene, chosen, progress)
+    if keep_suspects:
+        return SurveyedResult(result, surveyed, reliability_of(result.scene, result.problem))
     result, found = without_gross_errors(result, lambda scene: adjust(scene, chosen, progress))
     return SurveyedResult(result, surveyed, found)
 
@@ -138,6 +146,8 @@ def adjust_with_survey(points: Scene, options: Any, say: Callable[[str, int, int
         say("adjusting with measurements", event.iteration, event.max_iterations)
 
     told = weighted(points, told)
+    if options.keep_suspects:
+        return adjust(points, told, tell).scene
     return without_gross_errors(adjust(points, told, tell), lambda scene: adjust(scene, told, tell))[0].scene
 
 

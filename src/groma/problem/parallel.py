@@ -60,9 +60,9 @@ class Workers:
             self._pool = None
 
 
-#: Problems with fewer factors are one share: they are not worth a thread; nor is a share of less than half of it
-#: (cost: time only).
-FACTORS_FOR_THREADS = 50_000
+#: Problems with fewer factors are one share: they are not worth a thread; nor is a share of less than half of it. Where
+#: nothing is summed but costs, because nothing stays in a reduced system, fewer are (cost: time only).
+FACTORS_FOR_THREADS, FACTORS_ALONE = 50_000, 10_000
 #: Most shares, and most bytes that their copies of the reduced system take for every factor, about twice what its
 #: measurement does, unless two copies take more: even one thread has them all (cost: memory).
 MAX_SHARES, MAX_BYTES = 16, 96
@@ -74,7 +74,8 @@ USES_OF_A_BLOCK = 20
 def num_shares(layout: Layout) -> int:
     """Return into how many shares the work on a problem is divided, whatever the number of threads."""
     size = sum(chunk.size for chunk in layout.chunks)
-    if size < FACTORS_FOR_THREADS:
+    least = FACTORS_FOR_THREADS if layout.kept else FACTORS_ALONE
+    if size < least:
         return 1
     numbers = blocks = uses = 0
     for (a, b), (rows, _) in layout.blocks.items():
@@ -83,7 +84,7 @@ def num_shares(layout: Layout) -> int:
         uses += sum(len(seen.pair_slots) for seen in group.incidences.values())
         uses += sum(len(slots) for slots, _ in group.cross.values())
     count = min(MAX_SHARES, MAX_BYTES * size // max(8 * numbers, 1), len(layout.chunks) // 2)
-    count = min(count, 2 * size // max(FACTORS_FOR_THREADS, 1))
+    count = min(count, 2 * size // max(least, 1))
     if layout.eliminated:
         count = min(count, uses // max(USES_OF_A_BLOCK * blocks, 1)) if blocks else count
     return max(2, count)

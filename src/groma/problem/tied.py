@@ -2,12 +2,15 @@
 """Landmarks that factors tie to other landmarks, apart from the rest of their group.
 
 Of two landmarks that a factor couples only one can be eliminated. In comes a problem; out comes the same one in which
-the few that must stay in the reduced system form a group of their own, so that all others are eliminated.
+the few that must stay in the reduced system form a group of their own, so that all others are eliminated; and the way
+back, from what is found for the parts of a group to the whole of it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 
@@ -53,11 +56,54 @@ class Tied:
             parts += [replace(part, **refs)] if len(part) else []
         return parts
 
-    def join(self, states: dict[str, FloatArray]) -> dict[str, FloatArray]:
-        """Return states of the divided problem as those of the whole one."""
-        whole = np.empty((len(self.is_tied), states[self.group].shape[1]))
-        whole[~self.is_tied], whole[self.is_tied] = states[self.group], states[self.name]
-        return {**{name: state for name, state in states.items() if name != self.name}, self.group: whole}
+    def join(self, values: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        """Return values, such as states, of the variables of the divided problem as those of the whole one."""
+        whole = np.empty((len(self.is_tied), *values[self.group].shape[1:]))
+        whole[~self.is_tied], whole[self.is_tied] = values[self.group], values[self.name]
+        return {**{name: value for name, value in values.items() if name != self.name}, self.group: whole}
+
+
+@dataclass(frozen=True)
+class Divided:
+    """A problem in which tied landmarks are groups of their own."""
+
+    problem: Problem
+    tied: tuple[Tied, ...]
+
+    def parts(self, group: str) -> list[tuple[str, IntArray]]:
+        """Return the groups that hold the variables of a group of the whole, and which of its rows each has."""
+        for tied in self.tied:
+            if tied.group == group:
+                return [(group, np.flatnonzero(~tied.is_tied)), (tied.name, np.flatnonzero(tied.is_tied))]
+        return [(group, np.arange(len(self.problem.variables[group])))]
+
+    def places(self, group: str, index: IntArray) -> Iterator[tuple[IntArray, str, IntArray]]:
+        """Yield for each part of a group: which variables of ``index`` it holds, its name, their rows in it."""
+        for name, mine in self.parts(group):
+            at = np.flatnonzero(np.isin(index, mine))
+            if len(at):
+                yield at, name, np.searchsorted(mine, index[at])
+
+    def whole(self, group: str, row: int) -> tuple[str, int]:
+        """Return the group and the row of a variable in the whole problem."""
+        for tied in self.tied:
+            if group in (tied.group, tied.name):
+                return tied.group, int(np.flatnonzero(tied.is_tied == (group == tied.name))[row])
+        return group, row
+
+    def divide(self, values: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        """Return values of the variables of the whole problem as those of the divided one."""
+        return {name: value[mine] for group, value in values.items() for name, mine in self.parts(group)}
+
+    def join(self, values: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        """Return values of the variables of the divided problem as those of the whole one."""
+        return reduce(lambda parts, tied: tied.join(parts), self.tied, dict(values))
+
+
+def with_tied_apart(problem: Problem, eliminate: str | tuple[str, ...] = "auto") -> Divided:
+    """Return the problem with the landmarks that must be kept apart; as it is where it is said what to eliminate."""
+    tied = find_tied(problem) if eliminate == "auto" else []
+    return Divided(reduce(lambda whole, group: group.divide(whole), tied, problem), tuple(tied))
 
 
 def find_tied(problem: Problem) -> list[Tied]:

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from groma.scene.scene import Scene
 
 #: A scene is far from the origin if that is so many times as far as half of its cameras and points from their middle;
-#: and of unusual size if these are so many units, or so many of them a unit, from there.
+#: and of unusual size if these are so many units, or so many of them a unit, from there (convention: three
+#: of sixteen digits are given away).
 FAR = 1000.0
 
 

@@ -8,7 +8,8 @@ import numpy as np
 from groma._typing import FloatArray, IntArray
 from groma.scene.scene import Scene
 
-#: Members farther from their middle than this multiple of what holds four fifths of them are left out.
+#: Members farther from their middle than this multiple of what holds four fifths of them are left out (convention: of
+#: what is drawn).
 _FAR = 3.0
 #: Colours that are told apart by most eyes, the first ones best.
 PALETTE = np.array(

@@ -18,8 +18,7 @@ landmarks in shards (``reduce/shards.py``).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import reduce
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,7 +29,7 @@ from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations, to_original_order, to_solver_order
 from groma.problem.parallel import FACTORS_FOR_THREADS, Workers
 from groma.problem.problem import Problem
-from groma.problem.tied import find_tied
+from groma.problem.tied import with_tied_apart
 from groma.solver.damped_problem import DampedProblem, T
 from groma.solver.independent import STRETCH, IndependentProblem, stretch_factor
 from groma.solver.joint import JointProblem
@@ -39,7 +38,7 @@ from groma.solver.options import SolverOptions
 from groma.solver.report import Iteration, SolveReport, Stopwatch, count_unknowns, note_costs, warn_of_oddities
 from groma.solver.standing import Standing
 from groma.solver.steps import States
-from groma.solver.termination import Criteria, Termination
+from groma.solver.termination import Criteria, Termination, is_beyond_cost
 
 #: Called after every step tried; returning False stops the solve.
 Progress = Callable[[Iteration], bool | None]
@@ -83,9 +82,8 @@ def solve(problem: Problem, options: SolverOptions | None = None, progress: Prog
     report = SolveReport(num_factors=sum(map(len, problem.factors)), num_residuals=problem.num_residuals)
     watch = Stopwatch(report)
     with watch("setup"):
-        tied = find_tied(problem) if options.eliminate == "auto" else []
-        divided = reduce(lambda whole, group: group.divide(whole), tied, problem)
-        layout = lay_out(divided, options.eliminate)
+        parts = with_tied_apart(problem, options.eliminate)
+        layout = lay_out(parts.problem, options.eliminate)
     report.notes += layout.warnings
     report.num_unknowns = count_unknowns(problem)
     if not layout.factors:
@@ -101,8 +99,7 @@ def solve(problem: Problem, options: SolverOptions | None = None, progress: Prog
         workers.close()
     warn_of_oddities(report)
     report.seconds["total"] = watch.elapsed()
-    found = reduce(lambda parts, group: group.join(parts), tied, to_original_order(layout, states))
-    return Solution(problem.with_states(found), report)
+    return Solution(problem.with_states(parts.join(to_original_order(layout, states))), report)
 
 
 def minimise(
@@ -172,6 +169,8 @@ def minimise(
 
 def _improved(problem: DampedProblem[T], trial: T, best: T, share: float) -> tuple[T, bool]:
     """Return a trial, or a better one from where it led, and whether to accept it."""
+    if is_beyond_cost(trial, best):
+        return replace(trial, gain_ratio=1.0), True
     if not trial.lowers(best, share):
         rescued = problem.rescue(trial)
         return (rescued, True) if rescued.lowers(best, share) else (trial, False)

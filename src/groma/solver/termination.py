@@ -6,12 +6,17 @@ from __future__ import annotations
 from enum import Enum
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 if TYPE_CHECKING:
     from groma.solver.damped_problem import Trial
     from groma.solver.options import SolverOptions
 
 #: A step below this fraction of the states changes nothing in double precision.
 NO_CHANGE = 1e-14
+#: A decrease below this fraction of the cost may be one of rounding: the sum of many squares has some digits less than
+#: double precision.
+ROUNDING = 1e-14
 
 
 class Termination(Enum):
@@ -119,6 +124,17 @@ def cost_converged(decrease: float, previous: float, gain_ratio: float, withheld
     return decrease * max(decrease / previous, abs(1.0 - gain_ratio)) + withheld <= tolerance
 
 
+def is_beyond_cost(trial: Trial, best: Trial) -> bool:
+    r"""Whether a step promises less than the rounding of the cost, so that the cost cannot tell whether it is good.
+
+    The gradient still can: it is exact to more digits. Near the minimum the cost F says nothing of states within
+    :math:`\sqrt{2 \epsilon F}` standard deviations. Such a step is taken without asking the cost.
+    """
+    rounding = ROUNDING * best.cost
+    told = trial.promised > rounding or trial.num_hidden > best.num_hidden
+    return not told and trial.cost - best.cost <= 10.0 * rounding
+
+
 class Criteria:
     """The tests for convergence after every step."""
 
@@ -126,13 +142,20 @@ class Criteria:
         self._options = options
         #: Relative decrease in the last step, 0 where it was refused.
         self.fell = 0.0
+        #: What the last step promised, where the cost cannot tell.
+        self._promised = np.inf
 
     def after_accepted(self, trial: Trial, best: Trial) -> Termination | None:
         """Return why to stop after a step from ``best`` to ``trial``."""
         if trial.settled is not None:
             return Termination.COST_CONVERGED if trial.settled else None
+        tolerance = self._options.function_tolerance
+        if is_beyond_cost(trial, best):  # on, where that is wanted, as long as the gradient gets smaller
+            before, self._promised = self._promised, trial.promised
+            smaller = tolerance == 0.0 and trial.promised < 0.25 * before
+            return None if smaller and trial.relative_length > NO_CHANGE else Termination.COST_CONVERGED
         before, self.fell = self.fell, (best.cost - trial.cost) / best.cost
-        withheld, tolerance = trial.withheld / best.cost, self._options.function_tolerance
+        withheld = trial.withheld / best.cost
         if cost_converged(self.fell, before, trial.gain_ratio, withheld, tolerance):
             return Termination.COST_CONVERGED
         return Termination.STEP_CONVERGED if trial.relative_length <= self._options.step_tolerance else None

@@ -83,7 +83,11 @@ class History:
     def note(self, status: str, seconds: dict[str, float] | None = None) -> None:
         """Count a frame and its times."""
         self.statuses[status] = self.statuses.get(status, 0) + 1
-        for stage, value in (seconds or {}).items():
+        self.note_stages(seconds or {})
+
+    def note_stages(self, seconds: dict[str, float]) -> None:
+        """Keep the times of stages."""
+        for stage, value in seconds.items():
             self.seconds.setdefault(stage, []).append(value)
 
     def note_pose(self, track_map: TrackMap, timestamp: float, pose: FloatArray, submap: int = 0) -> None:

@@ -3,10 +3,10 @@
 
 ::
 
-    each frame      check it - predict - follow points and lines, assign planes - estimate the pose
-                    if that fails: find the pose by described features, lines and planes
-    now and then    make a keyframe - add landmarks - adjust the window - look for loops
-    at the end      adjust all keyframes
+    each frame            check it - predict - follow points and lines, assign planes - estimate the pose
+                          if that fails: find the pose by described features, lines and planes
+    behind the answer     now and then: make a keyframe - add landmarks - adjust the window - look for loops
+    at the end            adjust all keyframes
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from groma.geometry import se3
 from groma.io.sequences.frame import Frame, SequenceCamera
 from groma.io.trajectories import Trajectory
 from groma.scene import Scene
+from groma.tracking.backend.behind import Behind
 from groma.tracking.backend.mapper import Mapper, Present
 from groma.tracking.backend.submaps import about_submaps
 from groma.tracking.ending import Ending
@@ -34,8 +35,7 @@ from groma.tracking.frame.checks import FrameChecks
 from groma.tracking.frame.coarse_alignment import turned, turned_prediction
 from groma.tracking.frame.features import FrameFeatures
 from groma.tracking.frame.rectification import RightTurn
-from groma.tracking.map.keyframes import Followed, keyframe_nearby, wants_keyframe
-from groma.tracking.map.points import find_again
+from groma.tracking.map.keyframes import Followed, wants_keyframe
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.options import TrackOptions
 from groma.tracking.outcome import (
@@ -50,8 +50,7 @@ from groma.tracking.outcome import (
     TrackedFrame,
     TrackResult,
 )
-from groma.tracking.pose.estimate import PoseEstimate
-from groma.tracking.pose.following import Attempt, find_points_again, follow_frame
+from groma.tracking.pose.following import Attempt, find_points_again, follow_frame, follow_nearby
 from groma.tracking.pose.initialise import Initialiser
 from groma.tracking.pose.prediction import MotionModel
 from groma.tracking.pose.relocalise import Found, promote
@@ -96,6 +95,9 @@ class Tracker:
         self._guess = np.zeros((0, 0), np.uint8), self._present.pose
         #: What happened to the track between its maps, for the reader.
         self._breaks: list[tuple[float, float]] = []
+        #: What follows the answer of the frame before, and how the right camera is turned if not as was taken.
+        self._behind = Behind(self.options.threaded)
+        self._better: RightTurn | None = None
         #: Whether the frame before had to be searched.
         self._searched = False
         self._finished = False
@@ -103,16 +105,19 @@ class Tracker:
     @property
     def map(self) -> TrackMap:
         """The map so far."""
+        self._settle()
         return self._mapper.map
 
     def begun_anew(self) -> Tracker | None:
         """End this track and return one for the same frames, if the right camera is turned far from what was taken."""
-        if self._mapper.better_turn is None:
+        if self._better is None:
             return None
         self._finished = True
+        self._settle()
+        self._behind.close()
         self._mapper.abandon()
         self._mapper.close()
-        return Tracker(self._given, self.options, self._mapper.better_turn, self._saved)
+        return Tracker(self._given, self.options, self._better, self._saved)
 
     # ------------------------------------------------------------------------------------------------- each frame
 
@@ -123,6 +128,8 @@ class Tracker:
         ----------
         frame, following
             The frame, and the one after it if it is there already: its planes are found meanwhile, to the same result.
+
+        The answer does not wait for the work on the map that this frame causes: that goes on until the next one.
 
         Returns
         -------
@@ -144,40 +151,58 @@ class Tracker:
             return self._skip(frame, reason, began)
         present, mapper = self._present, self._mapper
         data = self._ahead.take(frame)
-        mapper.advance(present, watch)
         self._ahead.announce(following, mapper.frame_pool, mapper.workers if self._searched else None)
+        with watch("map"):
+            self._settle()
         if not self.map.keyframes:
-            return self._start(data, began, watch)
+            return self._answer(self._start(data, began, watch))
         attempt, found = self._follow(data, watch), None
         self._searched = attempt.estimate is None
         if self._searched:
             attempt, found = self._search(data, attempt, watch)
         estimate, followed = attempt.estimate, attempt.followed
         if estimate is None:
-            return self._lose(data, attempt.predicted, began, watch)
+            return self._answer(self._lose(data, attempt.predicted, began, watch))
         pose, status = estimate.pose, FOUND if self._lost_for else TRACKED
-        with watch("again"):
-            followed = find_points_again(self.map, data, pose, followed)
         self._motion.update(present.pose if self._lost_for == 0 else None, pose, frame.timestamp)
         if estimate.weak and status == TRACKED:
             status = WEAK
         self._lost_for = 0
         present.pose, present.data, present.followed = pose, data, followed
         present.frames_since_keyframe += 1
-        is_keyframe = False
-        if mapper.due is None and (
-            found is not None
-            or (
-                wants_keyframe(self.map, pose, followed, present.frames_since_keyframe, self.options)
-                and not self._visit_nearby(data)
-            )
+        # What was found by features alone cannot be followed; the next frame needs this one's landmarks.
+        at_once = found is not None and mapper.due is None
+        is_keyframe = at_once or self._follow_more(data, watch)
+        return self._answer(self._report(frame, status, estimate, is_keyframe, began, watch), at_once)
+
+    def _follow_more(self, data: FrameFeatures, watch: Stopwatch) -> bool:
+        """Find points again where there are few; choose the frame as a keyframe if it should be one."""
+        present, mapper = self._present, self._mapper
+        with watch("again"):
+            present.followed = find_points_again(mapper.map, data, present.pose, present.followed)
+        since = present.frames_since_keyframe
+        if mapper.due is not None or not wants_keyframe(
+            mapper.map, present.pose, present.followed, since, self.options
         ):
-            mapper.choose(present, data)
-            is_keyframe = True
-            if found is not None:
-                # What was found by features alone cannot be followed; the next frame needs this one's landmarks.
-                mapper.make_keyframe(present, watch)
-        return self._report(frame, status, estimate, is_keyframe, began, watch)
+            return False
+        nearby = None if mapper.busy else follow_nearby(mapper.map, data, present.pose, present.followed)
+        if nearby is not None:
+            present.followed, present.frames_since_keyframe = nearby, 0
+            return False
+        mapper.choose(present, data)
+        return True
+
+    def _answer(self, tracked: TrackedFrame, at_once: bool = False) -> TrackedFrame:
+        """Begin with what follows the answer of a frame in the map, perhaps with a keyframe of it at once."""
+        self._behind.begin(partial(self._mapper.advance, self._present, at_once))
+        return tracked
+
+    def _settle(self) -> None:
+        """Wait for what follows the answer of the frame before."""
+        watch = self._behind.result()
+        if watch is not None:
+            self._history.note_stages(watch.seconds)
+            self._better = self._mapper.better_turn
 
     def _follow(self, data: FrameFeatures, watch: Stopwatch) -> Attempt:
         """Predict the pose and follow the frame before, if that is not long ago."""
@@ -208,7 +233,10 @@ class Tracker:
             # The frame before is the nearest there is to look for.
             mapper.keep_present(present, watch)
         with watch("find"), work_with(None if mapper.threaded else 1):
-            found = self._find(data, attempt.predicted, attempt.prior_sigma, unconfirmed)
+            guesses = [attempt.predicted, present.pose] + ([unconfirmed.pose] if unconfirmed is not None else [])
+            found = self._verification.find(
+                self.map, data, guesses, attempt.predicted, attempt.prior_sigma, self._lost_for
+            )
         if found is not None and not (
             attempt.trusted and unconfirmed is not None and self._verification.score(unconfirmed) >= found.score
         ):
@@ -241,36 +269,6 @@ class Tracker:
         if better is None:
             return predicted, prior_sigma
         return better, np.maximum(prior_sigma, [0.0] * 3 + [gates.sigma] * 3)
-
-    def _find(self, data, predicted, prior_sigma, unconfirmed: PoseEstimate | None) -> Found | None:
-        """Find a pose by described features: near the last keyframes first, then anywhere."""
-        if self._lost_for <= self._gates.lost_frames:
-            guesses = [predicted, self._present.pose] + ([unconfirmed.pose] if unconfirmed is not None else [])
-            found = self._verification.find_near(self.map, data, guesses, predicted, prior_sigma)
-            if found is not None:
-                return found
-        found = self._verification.find_anywhere(self.map, data)
-        if found is None or self._lost_for > self._gates.lost_frames:
-            return found
-        return found if self._verification.is_near(found.estimate.pose, predicted, prior_sigma) else None
-
-    def _visit_nearby(self, data: FrameFeatures) -> bool:
-        """Follow an older keyframe that stands for the present pose; return whether there is one, still seen well."""
-        keyframe = keyframe_nearby(self.map, self._present.pose, self.options)
-        if keyframe is None or self._mapper.busy:
-            return False
-        self.map.visit(keyframe)
-        points, most = self._present.followed.points, self.options.num_points
-        found = find_again(
-            self.map, self.camera, data.gray, self._present.pose, points, most, self.options.gates.points
-        )
-        points = points.joined(found)
-        seen = np.isin(keyframe.measured.points.index, points.index).sum()
-        if seen < self.options.keyframe_share * len(keyframe.measured.points):
-            return False
-        self._present.followed = Followed(points, self._present.followed.lines)
-        self._present.frames_since_keyframe = 0
-        return True
 
     # -------------------------------------------------------------------------------------------------- keyframes
 
@@ -360,6 +358,9 @@ class Tracker:
         """
         self._finished, mapper, history = True, self._mapper, self._history
         ending = Ending(mapper, history)
+        self._behind.stand_still()
+        ending.attempt("what followed the last frame", self._settle, None)
+        self._behind.close()
         ending.settle(self._present)
         where = ending.join()
         roots = sorted({root for root, _ in where if mapper.maps[root].keyframes}) or [0]
@@ -381,6 +382,7 @@ class Tracker:
 
     def statistics(self) -> dict:
         """Return counts and times so far as plain numbers."""
+        self._settle()
         out: dict = {
             "frames": dict(self._history.statuses),
             **self._mapper.numbers(),

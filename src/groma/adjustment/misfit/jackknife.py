@@ -32,10 +32,12 @@ from groma.gates import gate
 from groma.problem.problem import Problem
 from groma.problem.residuals import jacobians_of, residuals_of
 from groma.solver.covariance.marginals import Covariances
+from groma.solver.linear.blas import one_blas_thread
 
 #: What is left out, one after the other, and what only relations refer to.
 _LANDMARKS, _STRUCTURE = ("points", "lines"), ("planes", "directions")
-#: Numbers in the largest arrays of one batch of landmarks, and batches that are worked on before they are added.
+#: Numbers in the largest arrays of one batch of landmarks, and batches that are worked on before they are added
+#: (cost: memory).
 _BATCH, _AT_ONCE = 300_000, 16
 
 
@@ -87,7 +89,11 @@ def landmark_jackknife(covariances: Covariances) -> tuple[FloatArray, FloatArray
         Of :func:`observations_alone`, at its solution, with the loss it was solved with.
     """
     problem = covariances.problem
-    sizes = {name: group.manifold.dof for name, group in problem.variables.items() if name not in _LANDMARKS}
+    sizes = {
+        name: group.manifold.dof
+        for name, group in problem.variables.items()
+        if name not in _LANDMARKS and (name == "frames" or not group.is_constant)
+    }
     names, first = list(sizes), {}
     every: list[tuple[str, int]] = []
     for name in names:
@@ -96,10 +102,11 @@ def landmark_jackknife(covariances: Covariances) -> tuple[FloatArray, FloatArray
     stated = np.pad(covariances.joint(every), (0, 1))
     size, summed, curvature = len(stated), np.zeros_like(stated), np.zeros(2)
     for kind in (kind for kind in _LANDMARKS if kind in problem.variables):
-        rows = [_rows_of(factor, kind, problem, first, size - 1, curvature) for factor in problem.factors]
+        rows = [_rows_of(factor, kind, problem, first, curvature) for factor in problem.factors]
         together = _joined([one for one in rows if one is not None], size - 1)
-        for moved in _pulls(together, stated) if together is not None else ():
-            summed += moved.T @ moved  # in their order, whoever made them
+        with one_blas_thread():
+            for moved in _pulls(together, stated) if together is not None else ():
+                summed += moved.T @ moved  # in their order, whoever made them
     share = max(curvature[0] / max(curvature[1], 1e-300), 0.1)
     found = stated @ summed @ stated / share**2
     at = first["frames"] + sizes["frames"] * np.arange(len(problem.variables["frames"]))[:, None] + np.arange(6)
@@ -111,9 +118,7 @@ def landmark_jackknife(covariances: Covariances) -> tuple[FloatArray, FloatArray
     return blocks[0], blocks[1]
 
 
-def _rows_of(
-    factor: Factor, kind: str, problem: Problem, first: dict[str, int], none: int, curvature: FloatArray
-) -> _Rows | None:
+def _rows_of(factor: Factor, kind: str, problem: Problem, first: dict[str, int], curvature: FloatArray) -> _Rows | None:
     """Return the rows of a group of factors that observe landmarks of a kind; add to sums of psi' and weights."""
     slot = next((slot.name for slot, ref in factor.references() if ref.group == kind), None)
     if slot is None or len(factor) == 0:
@@ -129,12 +134,11 @@ def _rows_of(
     whiten = np.sqrt(weight)[:, None, None] * whiten
     parts, columns = [], []
     for one, ref in factor.references():
-        if one.name == slot:
+        if one.name == slot or ref.group not in first:
             continue
         parts.append(whiten @ blocks[one.name])
         dof = parts[-1].shape[2]
-        begin = first[ref.group] + dof * ref.index[:, None] if ref.group in first else np.full((len(factor), 1), none)
-        columns.append(begin + (np.arange(dof) if ref.group in first else np.zeros(dof, np.int64)))
+        columns.append(first[ref.group] + dof * ref.index[:, None] + np.arange(dof))
     by_landmark = whiten @ blocks[slot]
     if problem.variables[kind].is_constant:
         by_landmark = np.zeros_like(by_landmark)
@@ -187,9 +191,10 @@ def _pull(rows: _Rows, stated: FloatArray, taken: IntArray) -> FloatArray:
     V = np.swapaxes(own, 1, 2) @ own
     V += 1e-12 * (np.trace(V, axis1=1, axis2=2)[:, None, None] + 1e-300) * np.eye(V.shape[1])
     free = np.eye(own.shape[1]) - own @ np.linalg.solve(V, np.swapaxes(own, 1, 2))
-    between = stated[columns[:, :, None, :, None], columns[:, None, :, None, :]]
-    shared = J[:, :, None] @ between @ np.swapaxes(J, 2, 3)[:, None]
-    leverage = free @ np.swapaxes(shared, 2, 3).reshape(free.shape) @ free
+    between = stated[columns[:, :, :, None], columns.reshape(batch, 1, 1, -1)]
+    half = np.swapaxes((J @ between).reshape(batch, -1, number, J.shape[3]), 1, 2)
+    shared = half @ np.swapaxes(J, 2, 3)  # (B, second observation, rows of all first ones, its rows)
+    leverage = free @ np.swapaxes(shared, 1, 2).reshape(free.shape) @ free
     error = _without_own(leverage, free @ rows.residual[taken].reshape(batch, -1, 1))
     pull = np.swapaxes(J, 2, 3) @ error.reshape(batch, number, -1, 1)
     flat = columns.reshape(batch, -1) + len(stated) * np.arange(batch)[:, None]

@@ -80,11 +80,11 @@ def _by_directions(scene: Scene, notes: list[str]) -> Similarity:
         wanted, seen = table.vector[of_images], _in_world(scene, of_images, np.eye(3))
         rotation = _rotation(seen, wanted)
         _check_axes(scene, of_images, wanted, _median_angle(rotation, seen, wanted))
-        down = table.in_camera[of_images][wanted[:, 2] < -0.99, 1]
-        if len(down) and np.median(down) < -0.5:
+        down = table.in_camera[of_images][wanted[:, 2] < -0.99, 1:]
+        if len(down) and np.median(down, axis=0).min() < -0.5:
             notes.append(
-                "In most photographs the direction of gravity is towards their top. Accelerometers measure up, and y "
-                "is up in OpenGL: turn the signs of the file, unless the cameras hang upside down."
+                "In most photographs gravity points to their top, or behind the camera. Accelerometers measure up, and "
+                "y is up in OpenGL: turn the signs of the file, unless the cameras hang upside down or look at the sky."
             )
     else:
         wanted, seen = table.vector, _of_landmarks(scene)

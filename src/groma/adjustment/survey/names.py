@@ -9,6 +9,7 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
+from groma._counted import counted
 from groma._typing import IntArray
 from groma.errors import InputError
 
@@ -49,6 +50,16 @@ def require_some(found: IntArray, wanted: Sequence[str], known: Sequence[str], s
             f"{source}: none of its {len(wanted)} names is {kind} of the scene; the first is {wanted[0]!r}{example}. "
             "Use the same names."
         )
+
+
+def tell_partly(found: IntArray, wanted: Sequence[str], known: Sequence[str], source: str) -> list[str]:
+    """Say which names were found without their folder or ending, in at most one sentence."""
+    pairs = {name: known[int(row)] for name, row in zip(wanted, found.tolist(), strict=True) if row >= 0}
+    partly = [(name, of) for name, of in pairs.items() if _whole(name) != _whole(of)]
+    if not partly:
+        return []
+    number = f"{counted(len(partly), 'names')} of images {'was' if len(partly) == 1 else 'were'}"
+    return [f"{source}: {number} found without folder or ending, such as {partly[0][0]} for {partly[0][1]}."]
 
 
 def _whole(name: str) -> str:

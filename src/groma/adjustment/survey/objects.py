@@ -21,7 +21,7 @@ from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.fit import noise_of
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.adjustment.survey.given import Survey
-from groma.adjustment.survey.names import nearest, rows_by_name
+from groma.adjustment.survey.names import nearest, rows_by_name, tell_partly
 from groma.adjustment.terms.objects import GROUPS
 from groma.errors import InputError
 from groma.gates import gate
@@ -226,6 +226,7 @@ def direction_table(scene: Scene, given: DirectionsFile, stated: float | None, n
 def pose_table(scene: Scene, given: PosesFile, stated: tuple[float, ...], notes: list[str]) -> CameraPoses:
     """Return the table of poses, with covariances in the axes of the cameras."""
     rows = rows_by_name(given.names, scene.images.names)
+    notes += tell_partly(rows, given.names, scene.images.names, given.source)
     known = np.flatnonzero(rows >= 0)
     if not len(known):
         find(given.names, scene, given.source, (Kind.IMAGE,))

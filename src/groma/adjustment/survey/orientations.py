@@ -19,7 +19,7 @@ from groma.scene import Scene
 _HALF_TURN = np.array([[1.0, 0.0, 0.0, 0.0]])
 #: From the axes x forward, y left, z up to ours, as a quaternion.
 _VEHICLE = np.array([[-0.5, 0.5, -0.5, 0.5]])
-#: Images that are tried for the turn of the whole, where places do not tell it.
+#: Images that are tried for the turn of the whole, where places do not tell it (cost: time).
 _TRIED = 50
 
 

@@ -15,7 +15,7 @@ from scipy.special import ndtri
 
 from groma.gates import gate
 
-#: The median of the size of a standard normal number.
+#: The median of the size of a standard normal number (derived from its distribution).
 _MEDIAN = 0.6745
 
 

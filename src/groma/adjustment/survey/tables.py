@@ -11,7 +11,7 @@ import numpy as np
 from groma._counted import counted
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.survey.given import Survey
-from groma.adjustment.survey.names import nearest, require_some, rows_by_name
+from groma.adjustment.survey.names import nearest, require_some, rows_by_name, tell_partly
 from groma.errors import InputError
 from groma.io.survey import ControlFile, Places
 from groma.scene import CameraPositions, ControlPoints, Marks, Scene
@@ -27,6 +27,7 @@ def position_table(scene: Scene, survey: Survey, xyz: FloatArray, notes: list[st
     assert given is not None
     rows = rows_by_name(given.names, scene.images.names)
     require_some(rows, given.names, scene.images.names, given.source, "an image")
+    notes += tell_partly(rows, given.names, scene.images.names, given.source)
     tell_unknown(given, rows, scene.images.names, "images that are not in the scene", notes)
     known = np.flatnonzero(np.asarray(rows) >= 0)
     sigma = sigma_of(given, survey.position_sigma, "--position-sigma")
@@ -48,6 +49,7 @@ def control_tables(
         )
     image = rows_by_name(given.image_names, scene.images.names)
     require_some(image, given.image_names, scene.images.names, places.source, "an image")
+    notes += tell_partly(image, given.image_names, scene.images.names, places.source)
     if missing := len(set(np.asarray(given.image_names)[image < 0].tolist())):
         notes.append(
             f"{places.source}: {counted(int((image < 0).sum()), 'marks')} in {counted(missing, 'images')} that are not "

@@ -13,16 +13,18 @@ from groma._typing import FloatArray, IntArray
 from groma.adjustment.terms.contract import Draft, Group, Term
 from groma.cameras import model as camera_model
 from groma.factors.contract import Factor, Ref
-from groma.factors.relations.line_direction import LineDirection
-from groma.factors.relations.line_on_plane import SegmentOnPlane
-from groma.factors.relations.lines_meeting import LinesMeeting
-from groma.factors.relations.orthogonal import OrthogonalDirections, OrthogonalPlanes, PlaneParallelToDirection
-from groma.factors.relations.parallel import (
+from groma.factors.relations.direction_pairs import (
     DirectionPair,
+    LineDirection,
+    OrthogonalDirections,
+    OrthogonalPlanes,
     ParallelDirections,
     ParallelPlanes,
+    PlaneParallelToDirection,
     PlanePerpendicularToDirection,
 )
+from groma.factors.relations.line_on_plane import SegmentOnPlane
+from groma.factors.relations.lines_meeting import LinesMeeting
 from groma.factors.relations.point_on_line import PointOnLine
 from groma.factors.relations.point_on_plane import PointOnPlane
 from groma.scene import Relations, Scene

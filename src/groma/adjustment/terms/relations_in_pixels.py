@@ -19,7 +19,7 @@ from groma.adjustment.terms.contract import Draft, Group, Term
 from groma.adjustment.terms.relations import metric_rows
 from groma.cameras import model as camera_model
 from groma.factors.contract import Factor, Ref
-from groma.factors.relations.line_direction import LineDirection
+from groma.factors.relations.direction_pairs import LineDirection
 from groma.factors.relations.line_to_pixel import LineToPixel
 from groma.factors.relations.on_plane_pixels import PointOnPlanePixels, SegmentOnPlanePixels
 from groma.factors.relations.point_to_image_line import PointToImageLine

@@ -178,6 +178,7 @@ def adjust(
     pose_sigma: _measured.PoseSigma = None,
     hold: _measured.Hold = None,
     crs: _measured.Crs = None,
+    keep_suspects: _measured.KeepSuspects = False,
     protocol: Annotated[
         Path | None,
         _measured.PANEL.option(

@@ -155,6 +155,7 @@ def map_(
     pose_sigma: _measured.PoseSigma = None,
     hold: _measured.Hold = None,
     crs: _measured.Crs = None,
+    keep_suspects: _measured.KeepSuspects = False,
     depth: _depth.Depth = None,
     depth_scale: _depth.DepthScale = None,
     relative_depth: _depth.RelativeDepth = False,
@@ -187,6 +188,7 @@ def map_(
         ("--line-matcher", line_matcher is not None and line_matches is not None, "without --line-matches"),
         ("--line-detector", line_detector != "lsd" and line_matches is not None, "without --line-matches"),
         ("--camera-params", model is not None and camera_params is not None, "on images without a model"),
+        ("--keep-suspects", keep_suspects and not measured, "on measurements (--positions, --control, ...)"),
         ("--truth", truth is not None and not contributions, "with --contributions, which compares with it"),
     )
     from groma.cli.shared.diagnosis import try_diagnosis
@@ -214,6 +216,7 @@ def map_(
         rigs=() if any(given is not None for given in (model, poses, extend)) else _rigs(console, images, rig),
         refine_rigs=refine_rig,
         rolling_shutter=rolling_shutter,
+        keep_suspects=keep_suspects,
         threads=console.threads,
         seed=seed,
     )

@@ -11,6 +11,7 @@ from groma.cli.shared import options as _options
 from groma.cli.shared.console import Console
 from groma.errors import InputError
 
+#: Simulated scenes (cost: time).
 _RUNS = 100
 
 

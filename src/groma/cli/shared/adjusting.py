@@ -151,10 +151,11 @@ def _adjusted(
     from groma.adjustment.adjust import adjust
 
     surveyed = bool(wanted.measured) or before.has_survey
-    if not surveyed and wanted.protocol is not None:
-        raise InputError(
-            "--protocol is of measurements; there are none. Add --positions, --control, --distances or others."
-        )
+    for option, given in (("--protocol", wanted.protocol), ("--keep-suspects", wanted.measured.keep_suspects or None)):
+        if not surveyed and given is not None:
+            raise InputError(
+                f"{option} is of measurements; there are none. Add --positions, --control, --distances or others."
+            )
     if not surveyed and wanted.rolling_shutter is None and not len(before.camera_motions):
         return before, adjust(before, options, progress), None, None
     from groma.adjustment.rolling_shutter import adjust_rolling_shutter, motions_of, with_rolling_shutter
@@ -168,8 +169,11 @@ def _adjusted(
             return before, adjust(before, options, progress), None, None
         return before, rolled.result, None, rolled.motions
     survey = wanted.measured.read(None, lambda: before.images.names) if wanted.measured else None
-    found = adjust_surveyed(before if rolled is None else rolled.result.scene, survey, options, progress)
-    motions = None if rolled is None else motions_of(found.result.scene, found.result.problem)
+    kept = wanted.measured.keep_suspects
+    found = adjust_surveyed(before if rolled is None else rolled.result.scene, survey, options, progress, kept)
+    motions = None if rolled is None else rolled.motions
+    if len(found.result.scene.camera_motions):
+        motions = motions_of(found.result.scene, found.result.problem)
     return found.surveyed.scene, found.result, found.to_dict(), motions
 
 

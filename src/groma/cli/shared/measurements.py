@@ -18,8 +18,10 @@ if TYPE_CHECKING:
 PANEL = Panel("Measurements")
 #: Residuals so many times as large as stated are told.
 WORSE = 2.0
-#: Wrong measurements that are named.
+#: Suspect measurements that are named.
 _LISTED = 5
+#: Units of residuals that are no lengths, by kind.
+_UNITS = {"mark": " pixels", "known direction": " degrees"}
 Positions = Annotated[
     str | None,
     PANEL.option(
@@ -125,6 +127,12 @@ Hold = Annotated[
         metavar="NAME,...",
     ),
 ]
+KeepSuspects = Annotated[
+    bool,
+    PANEL.option(
+        "Leave in what the test for gross errors would take out; it is named all the same.", "--keep-suspects"
+    ),
+]
 Crs = Annotated[
     str | None,
     PANEL.option(
@@ -155,6 +163,7 @@ class Measured:
     pose_sigma: str | None = None
     hold: str | None = None
     crs: str | None = None
+    keep_suspects: bool = False
 
     def __post_init__(self) -> None:
         """Refuse options that nothing is given for."""
@@ -269,7 +278,7 @@ def _sigma(text: str | None, option: str, count: tuple[int, int] = (1, 3)) -> tu
 
 
 def say_survey(console: Console, numbers: dict[str, Any]) -> None:
-    """Say how the scene got into its frame, how the measurements fit, and which are wrong."""
+    """Say how the scene got into its frame, how the measurements fit, and which do not agree with the rest."""
     for sentence in numbers.get("notes", ()):
         console.say(sentence)
     shown = [
@@ -291,16 +300,18 @@ def say_survey(console: Console, numbers: dict[str, Any]) -> None:
     first = {(one["kind"], one["name"]): one for one in reversed(suspects) if one["is_rejected"]}
     rejected = sorted(first.values(), key=lambda one: -abs(one["normalized"]))
     left = [one for one in suspects if not one["is_rejected"]]
-    _warn_of(console, "Taken out as wrong", rejected, "Correct or delete it.")
-    _warn_of(console, "Probably wrong", left, "Check it.")
+    _warn_of(console, "Taken out", rejected, "Correct or delete it, or keep it with --keep-suspects.")
+    _warn_of(console, "Suspect", left, "Check it.")
 
 
 def _warn_of(console: Console, what: str, measurements: Sequence[Mapping[str, Any]], advice: str) -> None:
     """Name the worst measurements, the worst first."""
     for one in measurements[:_LISTED]:
+        unit = " degrees" if "turn" in one["coordinate"] else _UNITS.get(one["kind"], "")
         console.warn(
             f"{what}: {one['kind']} {one['name']} {one['coordinate']}".rstrip()
-            + f" (residual {one['residual']:.4g}, {abs(one['normalized']):.1f} standard deviations). {advice}"
+            + f" disagrees with photographs and other measurements by {one['residual']:.4g}{unit} "
+            f"({abs(one['normalized']):.1f} standard deviations). {advice}"
         )
     if len(measurements) > _LISTED:
         console.warn(f"{what}: {len(measurements) - _LISTED} more, listed in the protocol.")

@@ -12,6 +12,7 @@ to images and points by identifier, so they survive changes made to the model by
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -22,7 +23,15 @@ from groma import cameras as camera_models
 from groma._typing import FloatArray
 from groma.errors import FileFormatError, InputError, OutputError
 from groma.io.atomic import atomic_output
-from groma.io.colmap.files import check_binary_model, check_text_rows, damage_in_text, find_model, is_model
+from groma.io.colmap.files import (
+    POINT,
+    check_binary_model,
+    check_text_rows,
+    damage_in_text,
+    find_model,
+    is_model,
+    points_in_images,
+)
 from groma.io.colmap.load import load_pycolmap
 from groma.io.colmap.quiet import quiet
 from groma.io.colmap.to_pycolmap import colmap_camera, to_pycolmap
@@ -62,13 +71,14 @@ def read_colmap(path: str | os.PathLike[str]) -> Scene:
     folder, form = find_model(path)
     pycolmap = load_pycolmap()
     with reading(folder, _KIND), quiet(pycolmap):
-        reconstruction = pycolmap.Reconstruction()
+        reconstruction, seen = pycolmap.Reconstruction(), None
         if form == "binary":
             check_binary_model(folder, _num_params_by_number(pycolmap))
             reconstruction.read_binary(str(folder))
+            seen = points_in_images(folder / "images.bin")
         else:
             _read_text(reconstruction, folder)
-        scene = from_pycolmap(reconstruction)
+        scene = _scene_of(reconstruction, seen)
         if form == "text":
             whole = _spaced_names(folder / "images.txt")
             pairs = zip(scene.images.ids.tolist(), scene.images.names, strict=True)
@@ -102,6 +112,11 @@ def _spaced_names(path: Path) -> dict[int, str]:
 
 def from_pycolmap(reconstruction: pycolmap.Reconstruction) -> Scene:
     """Return the scene that a :class:`pycolmap.Reconstruction` holds; frames without a pose are left out."""
+    return _scene_of(reconstruction)
+
+
+def _scene_of(reconstruction: pycolmap.Reconstruction, seen: Mapping[int, np.ndarray] | None = None) -> Scene:
+    """Do it; ``seen`` are the 2D points of each image, where they are known otherwise."""
     cameras = _cameras(reconstruction)
     camera_row = _rows(cameras.ids)
     rigs = Rigs(np.array(sorted(reconstruction.rigs), np.int64))
@@ -134,7 +149,8 @@ def from_pycolmap(reconstruction: pycolmap.Reconstruction) -> Scene:
         sensor_idx=np.array([sensor_row[rig_row[image.frame.rig_id], image.camera_id] for _, image in posed], np.int64),
     )
     points = _points(reconstruction)
-    observations, keypoints = _observations([image for _, image in posed], points)
+    found = [seen[number] if seen else _seen_in(image) for number, image in posed]
+    observations, keypoints = _observations(found, points)
     return Scene(cameras, rigs, sensors, frames, images, points, observations, keypoints)
 
 
@@ -206,19 +222,22 @@ def _points(reconstruction: pycolmap.Reconstruction) -> Points:
     )
 
 
-def _observations(images: list[Any], points: Points) -> tuple[PointObservations, Keypoints]:
+def _seen_in(image: Any) -> np.ndarray:
+    """The 2D points of an image."""
+    found = list(image.points2D)
+    seen = np.empty(len(found), POINT)
+    seen["xy"] = np.array([point.xy for point in found], float).reshape(-1, 2)
+    seen["point"] = np.array([point.point3D_id for point in found], np.uint64)
+    return seen
+
+
+def _observations(images: list[np.ndarray], points: Points) -> tuple[PointObservations, Keypoints]:
     """Return matched and unmatched 2D points, in the order of the images and within them."""
-    image_idx, keypoint_idx, pixel, point_ids = [], [], [], []
-    for row, image in enumerate(images):
-        found = list(image.points2D)
-        image_idx.append(np.full(len(found), row))
-        keypoint_idx.append(np.arange(len(found)))
-        pixel.append(np.array([point.xy for point in found], float).reshape(-1, 2))
-        point_ids.append(np.array([point.point3D_id for point in found], np.uint64))
     if not images:
         return PointObservations(), Keypoints()
-    image_all, keypoint_all = np.concatenate(image_idx), np.concatenate(keypoint_idx)
-    pixel_all, id_all = np.concatenate(pixel), np.concatenate(point_ids)
+    image_all = np.repeat(np.arange(len(images)), [len(found) for found in images])
+    keypoint_all, everything = np.concatenate([np.arange(len(found)) for found in images]), np.concatenate(images)
+    pixel_all, id_all = everything["xy"], everything["point"]
     matched = id_all != _NO_POINT
     wanted = id_all[matched].astype(np.int64)
     point_idx = np.searchsorted(points.ids, wanted)

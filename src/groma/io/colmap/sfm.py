@@ -24,6 +24,7 @@ from typing import Any
 from groma import cameras as camera_models
 from groma._counted import counted
 from groma.errors import GromaError, InputError, OutputError, did_you_mean
+from groma.io.colmap.large_photographs import features_of_large
 from groma.io.colmap.load import load_pycolmap
 from groma.io.colmap.mappers import MAPPERS, Task
 from groma.io.colmap.model import from_pycolmap
@@ -35,7 +36,7 @@ from groma.scene import Scene
 #: Bytes that must be free before work is handed to pycolmap, whose threads end the process where they find a full disk:
 #: in any case, for the features of an image, for the matches of a pair (cost: disk space).
 _ROOM, _IMAGE_ROOM, _PAIR_ROOM = 8 << 20, 4 << 20, 1 << 18
-#: Matches per image from which overlap and texture are not what is missing.
+#: Matches per image from which overlap and texture are not what is missing (convention: a word in a message).
 FEW_MATCHES = 100
 
 Progress = Callable[[str, int, int], None]
@@ -230,14 +231,13 @@ def _find_features(
     batch = options.threads or os.cpu_count() or 1
     for start in range(0, len(missing), batch):
         say("finding points in images", len(names) - len(missing) + start, len(names))
-        _check_room(database.parent, len(missing[start : start + batch]) * _IMAGE_ROOM)
-        pycolmap.extract_features(
-            database,
-            images,
-            image_names=missing[start : start + batch],
-            extraction_options=extraction,
-            device=pycolmap.Device.cpu,
-        )
+        wanted = missing[start : start + batch]
+        _check_room(database.parent, 2 * len(wanted) * _IMAGE_ROOM)  # large ones are in two databases for a moment
+        wanted = features_of_large(pycolmap, database, images, wanted, extraction)
+        if wanted:
+            pycolmap.extract_features(
+                database, images, image_names=wanted, extraction_options=extraction, device=pycolmap.Device.cpu
+            )
 
 
 def _match(

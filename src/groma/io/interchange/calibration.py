@@ -23,7 +23,8 @@ from groma.errors import FileFormatError
 from groma.scene import Cameras
 
 _Pair = tuple[float, float]
-#: Largest difference between the inverse polynomial and the model that stands for it, pixels.
+#: Largest difference between the inverse polynomial and the model that stands for it, pixels (convention: below
+#: what is measured).
 SLIP_PX = 0.01
 
 

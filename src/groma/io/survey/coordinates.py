@@ -161,11 +161,26 @@ def common_frame(groups: Sequence[Places], wanted: str | None = None) -> tuple[l
 
 
 def described(system: str) -> str:
-    """Return the name of a system for people."""
+    """Return the name of a system for people.
+
+    Raises
+    ------
+    InputError
+        If pyproj is there and knows no such system.
+    """
     code = system.removeprefix("EPSG:")
     if code.isdigit() and (32601 <= int(code) <= 32660 or 32701 <= int(code) <= 32760):
         return f"UTM zone {int(code) % 100} {'north' if int(code) < 32700 else 'south'} ({system})"
-    return system
+    try:
+        import pyproj  # type: ignore[import-not-found]  # an extra
+    except ImportError:
+        return f"{system} (as written; whether there is such a system is not checked without pyproj)"
+    try:
+        found = pyproj.CRS.from_user_input(system)
+    except pyproj.exceptions.CRSError:
+        raise InputError(f"pyproj knows no coordinate system {system}. Check the code, or write local.") from None
+    units = {axis.unit_name for axis in found.axis_info} - {"metre"}
+    return f"{found.name} ({', '.join([system, *sorted(units)])})"
 
 
 def _check(group: Places) -> None:

@@ -45,6 +45,8 @@ _COLUMNS = {
     "horizontal": ("horizontal", "horizontalaccuracy", "horzaccuracy", "sh", "hacc"),
     "vertical": ("vertical", "verticalaccuracy", "vertaccuracy", "sv", "vacc"),
 }
+#: Two numbers of which each has a comma, apart by something else.
+_DECIMAL_COMMAS = re.compile(r"\d,\d+\s*[;\s]\s*-?\d+,\d")
 _MEANING = {word: meaning for meaning, words in _COLUMNS.items() for word in words}
 
 
@@ -71,8 +73,16 @@ def read_positions(path: str | os.PathLike[str]) -> Places:
 
 
 def split(line: str) -> list[str]:
-    """Return the words of a line: between commas or semicolons where there are any, else between white space."""
-    mark = next((mark for mark in ",;\t" if mark in line), None)
+    """Return the words of a line: between semicolons, tabs or commas where there are any, else between white space.
+
+    Raises
+    ------
+    FileFormatError
+        If its numbers have decimal commas.
+    """
+    if _DECIMAL_COMMAS.search(line):
+        raise FileFormatError(f"{shown(line)} has decimal commas. Write points, as in 1.25.")
+    mark = next((mark for mark in ";\t," if mark in line), None)
     words = [word.strip().strip('"') for word in line.split(mark)]
     while words and not words[-1]:
         words.pop()

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from groma._typing import FloatArray
-from groma.adjustment.consistency import BAND, LIMIT, ConsistencyRow
+from groma.adjustment.consistency import BAND, LIMIT, NUM_IMAGES, RUNS, ConsistencyRow
 from groma.geometry import se3
 from groma.localization.pose.absolute_pose import AbsolutePose, PoseOptions, pose_from_matches
 from groma.localization.pose.camera import QueryCamera
@@ -25,7 +25,11 @@ KINDS = ("points", "lines", "both")
 
 
 def localization_consistency(
-    runs: int = 100, seed: int = 0, num_images: int = 15, noise_px: float = 0.5, believed_px: float | None = None
+    runs: int = RUNS,
+    seed: int = 0,
+    num_images: int = NUM_IMAGES,
+    noise_px: float = 0.5,
+    believed_px: float | None = None,
 ) -> tuple[ConsistencyRow, ...]:
     """Compare the covariances of localised poses with the errors that they predict.
 

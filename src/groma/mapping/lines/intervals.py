@@ -1,14 +1,45 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Lines of a scene with the intervals that their images support (:mod:`groma.estimators.line_intervals`)."""
+r"""Lines of a scene with the intervals that their images support (:mod:`groma.estimators.line_intervals`).
+
+The chord of a bowed edge fits the edge somewhere and leaves it towards its ends, though segments are seen there. With
+the distances :math:`r_k` of the segments that show a place from the line there, and their derivatives :math:`g_k` by a
+displacement across it, the edge lies beside the line at that place, and nothing supports the line, where
+
+.. math:: b^\top A^{-1} b > n\, w^2 + \chi^2_2\, \sigma^2, \qquad A = \sum_k g_k g_k^\top, \quad b = \sum_k r_k g_k :
+
+where one place in space explains a mean square distance of more than the width w of an edge, beyond usual noise.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from groma._typing import BoolArray
 from groma.estimators.line_intervals import supported_intervals
+from groma.gates import gate
 from groma.geometry import segment2
+from groma.geometry.algebra import ratio
+from groma.mapping.lines.gates import AGREEMENT
+from groma.mapping.noise.landmarks import line_end_rows, line_noise
 from groma.scene import LineIntervals, Scene
 from groma.scene.line_intervals import observed_shares
+
+
+@dataclass(frozen=True)
+class SupportGates:
+    """Beside which parts of a line its edge lies, in addition to when segments agree."""
+
+    parts: int = gate(24, "parts", "of a line, judged each on its own", "cost: memory; most ends are known no better")
+    min_leaving: int = gate(
+        2, "segments", "that leave a line where its edge lies beside it", "convention: one alone may be of another edge"
+    )
+
+
+GATES = SupportGates()
+#: Smallest share of an eigenvalue that counts (convention: rounding): a single image leaves one direction open.
+_SINGULAR = 1e-9
 
 
 def with_supported_intervals(scene: Scene) -> Scene:
@@ -19,10 +50,15 @@ def with_supported_intervals(scene: Scene) -> Scene:
     seen = scene.line_observations
     share, length = observed_shares(scene), segment2.length(seen.segment)
     size = np.maximum(share[:, 1] - share[:, 0], 1e-12) / np.maximum(length, 1e-12)
-    known = np.isfinite(share).all(axis=1)
-    line, found = supported_intervals(
-        seen.line_idx[known], seen.image_idx[known], share[known], size[known], scene.num_lines
-    )
+    beside = _beside_edges(scene)
+    known, bent = np.isfinite(share.sum(axis=1)), np.asarray(beside.any(axis=1))[seen.line_idx]
+    whole, cut = np.flatnonzero(known & ~bent), np.flatnonzero(known & bent)
+    bounds = np.arange(GATES.parts + 1) / GATES.parts
+    low, high = np.maximum(share[cut, :1], bounds[:-1]), np.minimum(share[cut, 1:], bounds[1:])
+    kept = (low < high) & ~beside[seen.line_idx[cut]]
+    rows = np.concatenate([whole, cut[np.nonzero(kept)[0]]])
+    share = np.concatenate([share[whole], np.column_stack([low[kept], high[kept]])])
+    line, found = supported_intervals(seen.line_idx[rows], seen.image_idx[rows], share, size[rows], scene.num_lines)
     count = np.bincount(line, minlength=scene.num_lines)
     first = np.cumsum(count) - count
     hull = np.tile([0.0, 1.0], (scene.num_lines, 1))
@@ -38,3 +74,25 @@ def with_supported_intervals(scene: Scene) -> Scene:
         lines=scene.lines.replace(segments=np.where((hull == [0.0, 1.0])[..., None], segments, moved)),
         line_intervals=LineIntervals(line, found[:, 0], found[:, 1]),
     )
+
+
+def _beside_edges(scene: Scene) -> BoolArray:
+    """Tell beside which parts (L, 24) of lines their edges lie."""
+    share, residual, row = line_end_rows(scene)
+    middle, width = (np.arange(GATES.parts) + 0.5) / GATES.parts, AGREEMENT.same_edge
+    known = np.isfinite(np.column_stack([residual, row.reshape(len(row), 4)]).sum(axis=1))
+    low, high = np.sort(share, axis=1).T
+    seen, part = np.nonzero((low[:, None] <= middle) & (middle <= high[:, None]) & known[:, None])
+    weight = (middle[part] - share[seen, 0]) / (share[seen, 1] - share[seen, 0])
+    away = residual[seen, 0] + weight * (residual[seen, 1] - residual[seen, 0])
+    x, y = (row[seen, 0] + weight[:, None] * (row[seen, 1] - row[seen, 0])).T
+    place, size = scene.line_observations.line_idx[seen] * GATES.parts + part, scene.num_lines * GATES.parts
+    count, leaving, xx, xy, yy, xr, yr = (
+        np.bincount(place, value, size)
+        for value in (np.ones(len(x)), np.abs(away) > width, x * x, x * y, y * y, x * away, y * away)
+    )  # fmt: skip
+    xx, yy = xx + _SINGULAR * (xx + yy), yy + _SINGULAR * (xx + yy)
+    determinant = xx * yy - xy**2
+    explained = ratio(yy * xr**2 - 2.0 * xy * xr * yr + xx * yr**2, determinant, determinant > 0.0, 0.0)
+    noise = AGREEMENT.max_squared(2) * line_noise(scene).sigma_px ** 2
+    return ((explained > width**2 * count + noise) & (leaving >= GATES.min_leaving)).reshape(-1, GATES.parts)

@@ -19,7 +19,7 @@ import numpy as np
 from scipy import sparse
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.execution import map_work
+from groma.execution import map_in_threads
 from groma.gates import gate
 from groma.geometry import quaternion
 from groma.scene import Scene
@@ -78,7 +78,7 @@ def covisible_neighbors(
         return _by_geometry(scene, num_neighbors, gates)
     sees = _sees(scene)
     shared = _Shared(sees, (sees @ sees.T).tocsr(), scene.points.xyz, scene.cam_centers_in_world, gates)
-    return map_work(partial(shared.best_of, num=num_neighbors, min_shared=min_shared), range(scene.num_images))
+    return map_in_threads(partial(shared.best_of, num=num_neighbors, min_shared=min_shared), range(scene.num_images))
 
 
 @dataclass(frozen=True, eq=False)

@@ -125,7 +125,8 @@ def build_views(
         "ends": np.zeros((0, 4)), "ray": np.zeros((0, 2, 3)), "across": np.zeros((0, 3)), "length": np.zeros(0),
         "usable": np.zeros(0, bool), "sigma": np.zeros(0), "range": np.zeros((0, 2)), "inverse_depth": np.zeros((0, 2)),
     }  # fmt: skip
-    parts = [none, *map_work(partial(_columns_of, scene, (min_length, noise, depth_margin), gates), work)]
+    cameras = scene.keep(points=[], lines=[], planes=[], directions=[])  # points travel with their images
+    parts = [none, *map_work(partial(_columns_of, cameras, (min_length, noise, depth_margin), gates), work)]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in none}
     sizes = [len(item.ends) for item in segments]
     return LineViews(

@@ -129,14 +129,7 @@ def line_noise(scene: Scene, sigma_px: float | None = None) -> LineNoise:
     squares, count = np.zeros(scene.num_lines), np.zeros(scene.num_lines, dtype=np.int64)
     line = table.line_idx
     for columns in (slice(0, 2), slice(2, 4)):
-        measured = np.ascontiguousarray(table.segment[:, columns])
-        share = _share_on_line(scene, table.image_idx, measured, ends[line])
-        place = ends[line, 0] + share[:, None] * (ends[line, 1] - ends[line, 0])
-        pixels, by_world = project_points(scene, table.image_idx, place)
-        tangent = unit(apply(by_world, direction[line]))
-        normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
-        residual = dot(normal, pixel_differences(scene, table.image_idx, pixels, measured))
-        row = np.einsum("nk,nki,nai->na", normal, by_world, across[line])
+        share, residual, row = _end_rows(scene, columns, direction, across)
         row = np.hstack([(1.0 - share)[:, None] * row, share[:, None] * row])
         good = np.isfinite(residual) & np.isfinite(row).all(axis=1)
         weight = good / table.sigma
@@ -146,6 +139,35 @@ def line_noise(scene: Scene, sigma_px: float | None = None) -> LineNoise:
         count += np.bincount(line[good], minlength=scene.num_lines)
     sigma, misfit = _misfit(squares, count - 4, sigma_px)
     return LineNoise(across, _inverse(information / sigma**2, _extent(scene)), misfit, sigma)
+
+
+def line_end_rows(scene: Scene) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return of both ends of the observed segments where on their lines they lie, (N, 2) shares, and how far across.
+
+    The latter are signed distances (N, 2) from the projected lines, pixels, and their derivatives (N, 2, 2) by a
+    displacement of the line there along two unit vectors across it. NaN where an end tells nothing.
+    """
+    ends = scene.lines.segments
+    direction = unit(ends[:, 1] - ends[:, 0])
+    across = np.stack(perpendicular(direction), axis=1)
+    parts = [_end_rows(scene, columns, direction, across) for columns in (slice(0, 2), slice(2, 4))]
+    share, residual, row = (np.stack(both, axis=1) for both in zip(*parts, strict=True))
+    return share, residual, row
+
+
+def _end_rows(
+    scene: Scene, columns: slice, direction: FloatArray, across: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Where on its line (N,) an end of each segment lies, how far across it (N,), derivatives (N, 2) of that there."""
+    table, line = scene.line_observations, scene.line_observations.line_idx
+    measured = np.ascontiguousarray(table.segment[:, columns])
+    share = _share_on_line(scene, table.image_idx, measured, scene.lines.segments[line])
+    first, last = scene.lines.segments[line].transpose(1, 0, 2)
+    pixels, by_world = project_points(scene, table.image_idx, first + share[:, None] * (last - first))
+    tangent = unit(apply(by_world, direction[line]))
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
+    residual = dot(normal, pixel_differences(scene, table.image_idx, pixels, measured))
+    return share, residual, np.einsum("nk,nki,nai->na", normal, by_world, across[line])
 
 
 def project_points(

@@ -58,7 +58,7 @@ class StructureOptions:
     min_probability: float = 0.7
     #: The same for lines on planes and along directions. It is higher, as a wrong relation bends a whole line, and as
     #: covariances do not contain errors that images share, such as those of an edge that is a groove.
-    min_line_probability: float = 0.9
+    min_line_probability: float = 0.85
     #: Landmarks seen in fewer images take no part: nothing checks their matches. A stereo pair is two images.
     min_views: int = 3
     #: Landmarks whose reprojection error is so many times the usual one take no part.
@@ -175,7 +175,7 @@ def _check(options: StructureOptions) -> None:
     if not (0.0 < level < 1.0 and 0.0 <= least < 1.0 and 0.0 <= least_line < 1.0):
         raise InputError(
             "level must lie between 0 and 1, min_probability and min_line_probability from 0 to below 1; got "
-            f"{level}, {least} and {least_line}. Usual values are 0.95, 0.7 and 0.9."
+            f"{level}, {least} and {least_line}. Usual values are 0.95, 0.7 and 0.85."
         )
 
 

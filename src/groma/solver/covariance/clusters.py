@@ -50,18 +50,20 @@ def clustered(covariances: Covariances, variable: Variable, landmarks: str, clus
 
 def with_kept(covariances: Covariances, group: str, index: int) -> dict[str, FloatArray]:
     """Return the covariances (count, dof, own dof) of the kept variables of all groups with one of them."""
-    layout, groups = covariances._layout, covariances.problem.variables
-    members = {member.group: (kept, member) for kept in layout.kept for member in kept.members}
-    rows = {}
-    for name, (kept, member) in members.items():
-        block = member.blocks(np.arange(len(groups[name])))[:, None]
+    layout, rows = covariances._layout, {}
+    groups = layout.problem.variables
+    for name, (c, member) in covariances._kept.items():
+        kept, block = layout.kept[c], member.blocks(np.arange(len(groups[name])))[:, None]
         rows[name] = kept.start + block * kept.width + member.offset + np.arange(groups[name].manifold.dof)
     own = groups[group].manifold.dof
     R = np.zeros((layout.num_kept_unknowns, own))
     R[rows[group][index], np.arange(own)] = 1.0
     free = ~np.concatenate(covariances._held)[:, None]
     solved = covariances._solve(R * free) * free
-    return {name: solved[at] for name, at in rows.items()}
+    found = {name: solved[at] for name, at in rows.items()}
+    for tied in covariances._divided.tied:  # what is eliminated of their group is not asked for
+        found.setdefault(tied.group, np.zeros((int((~tied.is_tied).sum()), groups[tied.group].manifold.dof, own)))
+    return covariances._divided.join(found)
 
 
 def _pushes(problem: Problem, factor: Factor, effect: dict[str, FloatArray], size: int) -> FloatArray:

@@ -18,7 +18,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations
 from groma.solver.linear.blocks import Blocks
-from groma.solver.linear.elimination import LANDMARK_TOLERANCE, eliminate, scaled_blocks
+from groma.solver.linear.elimination import LANDMARK_TOLERANCE, badly_conditioned, eliminate, scaled_blocks
 from groma.solver.linear.schur import ReducedSystem
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
@@ -155,8 +155,10 @@ class Landmarks:
         V = self._equations.V[e].reshape(-1, dof, dof).copy()
         steps = np.arange(dof)
         V[:, steps, steps] += held.reshape(-1, dof)
-        empty = (V[:, steps, steps] == 0.0).any(axis=1)
-        return empty | (np.linalg.eigvalsh(scaled_blocks(V)[0])[:, 0] < LANDMARK_TOLERANCE)
+        found = (V[:, steps, steps] == 0.0).any(axis=1)
+        few, blocks = badly_conditioned(scaled_blocks(V)[0], LANDMARK_TOLERANCE)
+        found[few] |= np.linalg.eigvalsh(blocks)[:, 0] < LANDMARK_TOLERANCE
+        return found
 
     def moved(self, e: int, X: FloatArray, threshold: float) -> BoolArray:
         """Return which landmarks follow the columns of X by more than a threshold, in units that make diag V one."""

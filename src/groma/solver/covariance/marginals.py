@@ -28,12 +28,14 @@ import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
+from groma.execution import num_threads
 from groma.geometry.conversions import conversion_jacobian
 from groma.geometry.manifold import Manifold
 from groma.problem.lay_out import lay_out
 from groma.problem.linearization import NormalEquations, to_solver_order
 from groma.problem.parallel import Workers
 from groma.problem.problem import Problem
+from groma.problem.tied import with_tied_apart
 from groma.solver.covariance.datum import FreeMotions, constrained, free_motions, held_coordinates
 from groma.solver.covariance.landmarks import Landmarks
 from groma.solver.covariance.rank_deficient import (
@@ -43,7 +45,7 @@ from groma.solver.covariance.rank_deficient import (
     loses_the_cameras,
     zero_modes,
 )
-from groma.solver.covariance.s_transform import Transformation, datum_weights, transformation
+from groma.solver.covariance.s_transform import Transformation, datum_of_parts, datum_weights, transformation
 from groma.solver.linear.blas import one_blas_thread
 from groma.solver.linear.blocks import Blocks
 from groma.solver.linear.fronts import Fronts
@@ -115,13 +117,18 @@ class Covariances:
         if gauge not in ("held", "inner"):
             raise InputError(f"gauge must be 'held' or 'inner'; got {gauge!r}.")
         self.problem = problem
-        self._layout = layout = lay_out(problem, eliminate)
+        self._divided = with_tied_apart(problem, eliminate)
+        self._layout = layout = lay_out(self._divided.problem, eliminate)
         states = to_solver_order(layout)
-        self._equations = equations = NormalEquations(layout, Workers(1))
+        workers = Workers(num_threads())
+        self._equations = equations = NormalEquations(layout, workers)
         self._system = ReducedSystem(equations)
         equations.linearize(states, equations.prepare(states))
         self._landmarks = Landmarks(layout, equations, self._system)
+        workers.close()
         self._position = {e.group: np.argsort(e.order) for e in layout.eliminated}
+        self._eliminated = {e.group: number for number, e in enumerate(layout.eliminated)}
+        self._kept = {member.group: (c, member) for c, kept in enumerate(layout.kept) for member in kept.members}
         self._held, self._held_landmarks = held_coordinates(layout)
         self._undetermined = [self._landmarks.undetermined(e, held) for e, held in enumerate(self._held_landmarks)]
         self._datum: Transformation | None = None
@@ -129,13 +136,10 @@ class Covariances:
         self._sigma: Blocks = {}
         if layout.kept:
             self._system.assemble(0.0)
-            self._unseen = [
-                (self._system.diagonal(c).reshape(-1) == 0.0) & ~self._held[c] for c in range(len(layout.kept))
-            ]
+            seen = [self._system.diagonal(c).reshape(-1) != 0.0 for c in range(len(layout.kept))]
+            self._unseen = [~(part | held) for part, held in zip(seen, self._held, strict=True)]
             with one_blas_thread():
-                self._invert(gauge, datum)
-
-    # Inversion
+                self._invert(gauge, datum and datum_of_parts(problem, self._divided, datum))
 
     def _invert(self, gauge: str, datum: Mapping[str, npt.ArrayLike] | None) -> None:
         layout = self._layout
@@ -191,8 +195,6 @@ class Covariances:
         with one_blas_thread():
             return self._fronts.solve(rhs / self._size[:, None]) / self._size[:, None]
 
-    # What is asked for
-
     def of(self, group: str, index: IntArray | int | None = None) -> FloatArray:
         """Return the covariances (len(index), dof, dof) of variables of a group; all of them by default.
 
@@ -205,14 +207,14 @@ class Covariances:
         """
         index = self._checked(group, index)
         dof = self.problem.variables[group].manifold.dof
-        for c, kept in enumerate(self._layout.kept):
-            for member in kept.members:
-                if member.group == group:
-                    return self._of_kept(c, member.blocks(index), slice(member.offset, member.offset + dof))
-        for e, eliminated in enumerate(self._layout.eliminated):
-            if eliminated.group == group:
-                return self._of_landmarks(e, self._position[group][index])
-        return np.zeros((len(index), dof, dof))
+        out = np.zeros((len(index), dof, dof))
+        for at, part, rows in self._divided.places(group, index):
+            if part in self._kept:
+                c, member = self._kept[part]
+                out[at] = self._of_kept(c, member.blocks(rows), slice(member.offset, member.offset + dof))
+            elif part in self._eliminated:
+                out[at] = self._of_landmarks(self._eliminated[part], self._position[part][rows])
+        return out
 
     def _checked(self, group: str, index: npt.ArrayLike | None) -> IntArray:
         if group not in self.problem.variables:
@@ -247,16 +249,18 @@ class Covariances:
     def undetermined(self, group: str) -> IntArray:
         """Return the indices of the unobservable variables of a group; their covariances are NaN."""
         self._checked(group, None)
-        for e, eliminated in enumerate(self._layout.eliminated):
-            if eliminated.group == group:
-                return np.sort(eliminated.order[self._undetermined[e]]).astype(np.int64)
-        for c, kept in enumerate(self._layout.kept):
-            for member in kept.members:
-                if member.group == group:
-                    blocks = member.blocks(np.arange(len(self.problem.variables[group])))
-                    part = self._unseen[c].reshape(kept.count, kept.width)[blocks]
-                    return np.flatnonzero(part[:, member.offset : member.offset + member.dof].any(axis=1))
-        return np.zeros(0, np.int64)
+        return np.sort(np.concatenate([mine[self._open(part)] for part, mine in self._divided.parts(group)]))
+
+    def _open(self, part: str) -> IntArray:
+        """Return the rows of the unobservable variables of a group of the divided problem."""
+        if (e := self._eliminated.get(part)) is not None:
+            return self._layout.eliminated[e].order[self._undetermined[e]].astype(np.int64)
+        if part not in self._kept:
+            return np.zeros(0, np.int64)
+        c, member = self._kept[part]
+        blocks = member.blocks(np.arange(len(self._layout.problem.variables[part])))
+        unseen = self._unseen[c].reshape(-1, self._layout.kept[c].width)[blocks]
+        return np.flatnonzero(unseen[:, member.offset : member.offset + member.dof].any(axis=1))
 
     def in_datum(self, increments: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """Free increments (count, dof) of all groups from their common motion: the errors that :meth:`of` describes.
@@ -266,15 +270,15 @@ class Covariances:
         moved = {name: np.array(part, dtype=np.float64) for name, part in increments.items()}
         if self._datum is None:
             return moved
-        layout, datum = self._layout, self._datum
-        views = []  # (group, rows of G, rows of D)
-        for c in layout.kept:
-            at = slice(c.start, c.start + c.count * c.width)
-            G, D = datum.G[at].reshape(c.count, c.width, -1), datum.D[at].reshape(c.count, c.width)
-            for member in c.members:
-                rows = member.blocks(np.arange(len(self.problem.variables[member.group])))
-                part = slice(member.offset, member.offset + member.dof)
-                views.append((member.group, G[rows, part], D[rows, part]))
+        layout, datum, views = self._layout, self._datum, []  # (group, rows of G, rows of D)
+        moved = self._divided.divide(moved)
+        for name, (c, member) in self._kept.items():
+            kept = layout.kept[c]
+            at = slice(kept.start, kept.start + kept.count * kept.width)
+            G, D = datum.G[at].reshape(kept.count, kept.width, -1), datum.D[at].reshape(kept.count, kept.width)
+            rows = member.blocks(np.arange(len(layout.problem.variables[name])))
+            part = slice(member.offset, member.offset + member.dof)
+            views.append((name, G[rows, part], D[rows, part]))
         for e, eliminated in enumerate(layout.eliminated):
             rows = self._position[eliminated.group]
             shape = (eliminated.count, eliminated.dof)
@@ -283,7 +287,7 @@ class Covariances:
         common = sum(np.einsum("nik,ni,ni->k", G, D, moved[name]) for name, G, D in views)
         for name, G, _ in views:
             moved[name] -= G @ (datum.Q @ common)
-        return moved
+        return self._divided.join(moved)
 
     def in_chart(self, group: str, chart: Manifold, index: IntArray | int | None = None) -> FloatArray:
         """Return covariances (n, dof, dof) of lines or planes for the increments of another chart."""
@@ -319,19 +323,18 @@ class Covariances:
             i = int(self._checked(group, i)[0])
             at = slice(int(start), int(start) + size)
             broken[at] = i in self.undetermined(group)
-            for kept in layout.kept:
-                for member in kept.members:
-                    if member.group == group:
-                        first = kept.start + int(member.blocks(np.array([i]))[0]) * kept.width + member.offset
-                        R[first : first + size, at] = np.eye(size)
-                        R[:, at] *= ~np.concatenate(self._held)[:, None]
-                        if self._datum is not None:
-                            rows = slice(first, first + size)
-                            rows_G.append((at, self._datum.G[rows], self._datum.A[rows]))
-            for e, eliminated in enumerate(layout.eliminated):
-                if eliminated.group != group:
-                    continue
-                p = int(self._position[group][i])
+            ((_, part, row),) = self._divided.places(group, np.array([i]))
+            if part in self._kept:
+                c, member = self._kept[part]
+                first = layout.kept[c].start + int(member.blocks(row)[0]) * layout.kept[c].width + member.offset
+                rows = slice(first, first + size)
+                R[rows, at] = np.eye(size)
+                R[:, at] *= ~np.concatenate(self._held)[:, None]
+                if self._datum is not None:
+                    rows_G.append((at, self._datum.G[rows], self._datum.A[rows]))
+            elif part in self._eliminated:
+                e = self._eliminated[part]
+                eliminated, p = layout.eliminated[e], int(self._position[part][row[0]])
                 for c, incidences in eliminated.incidences.items():
                     kept, B = layout.kept[c], self._landmarks.incidence(e, c)
                     for k in range(incidences.pointer[p], incidences.pointer[p + 1]):
@@ -339,10 +342,9 @@ class Covariances:
                         R[first : first + kept.width, at] += B[k].T
                 local = -self._landmarks.inverses(e)[p]
                 out[at, at] += local
-                for other, place in seen.items():  # the same landmark asked for twice
-                    if other == (group, i):
-                        out[at, place] += local
-                        out[place, at] += local
+                if (group, i) in seen:  # the same landmark asked for twice
+                    out[at, seen[group, i]] += local
+                    out[seen[group, i], at] += local
                 if self._datum is not None:
                     rows = slice(p * size, (p + 1) * size)
                     rows_G.append((at, self._datum.G_landmarks[e][rows], self._datum.A_landmarks[e][rows]))

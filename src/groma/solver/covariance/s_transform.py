@@ -22,6 +22,9 @@ import numpy.typing as npt
 from groma._typing import BoolArray, FloatArray
 from groma.errors import InputError
 from groma.problem.layout import Layout
+from groma.problem.problem import Problem
+from groma.problem.tied import Divided
+from groma.problem.variables import Variables
 from groma.solver.covariance.datum import FreeMotions
 from groma.solver.covariance.landmarks import Landmarks
 
@@ -113,6 +116,14 @@ def transformation(
     return Transformation(G, Y @ Q, G_landmarks, A_landmarks, K, D_kept, D_landmarks, Q)
 
 
+def datum_of_parts(problem: Problem, divided: Divided, datum: Mapping[str, npt.ArrayLike]) -> dict[str, npt.ArrayLike]:
+    """Return the weights of a datum with those of tied landmarks apart."""
+    weights = dict(datum)
+    for group in (tied.group for tied in divided.tied if tied.group in datum):
+        weights |= divided.divide({group: weights_of(problem.variables[group], group, datum[group])})
+    return weights
+
+
 def datum_weights(
     layout: Layout, datum: Mapping[str, npt.ArrayLike] | None, undetermined: list[BoolArray]
 ) -> tuple[FloatArray, list[FloatArray]]:
@@ -129,17 +140,19 @@ def datum_weights(
     for c in layout.kept:
         blocks = kept[c.start : c.start + c.count * c.width].reshape(c.count, c.width)
         for member in c.members:
-            weight = _weight(layout, member.group, 1.0 if datum is None else datum.get(member.group, 0.0))
+            value = 1.0 if datum is None else datum.get(member.group, 0.0)
+            weight = weights_of(layout.problem.variables[member.group], member.group, value)
             rows = member.blocks(np.arange(len(weight)))
             blocks[rows, member.offset : member.offset + member.dof] = weight
     for e, eliminated in enumerate(layout.eliminated):
-        weight = _weight(layout, eliminated.group, 0.0 if datum is None else datum.get(eliminated.group, 0.0))
+        value = 0.0 if datum is None else datum.get(eliminated.group, 0.0)
+        weight = weights_of(layout.problem.variables[eliminated.group], eliminated.group, value)
         landmarks[e] = np.where(undetermined[e][:, None], 0.0, weight[eliminated.order]).reshape(-1)
     return kept, landmarks
 
 
-def _weight(layout: Layout, group: str, value: npt.ArrayLike) -> FloatArray:
-    variables = layout.problem.variables[group]
+def weights_of(variables: Variables, group: str, value: npt.ArrayLike) -> FloatArray:
+    """Return the weights (count, dof) that a datum gives to the variables of a group."""
     shape = (len(variables), variables.manifold.dof)
     try:
         weight = np.broadcast_to(np.asarray(value, dtype=np.float64), shape)

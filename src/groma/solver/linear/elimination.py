@@ -80,13 +80,21 @@ def scaled_blocks(V: FloatArray) -> tuple[FloatArray, FloatArray]:
     return V / size[:, :, None] / size[:, None, :], size
 
 
+def badly_conditioned(V: FloatArray, tolerance: float) -> tuple[IntArray, FloatArray]:
+    """Return all rows with an eigenvalue below a tolerance, and perhaps some more, of V with a diagonal of ones.
+
+    The other n - 1 eigenvalues sum up to n at most, so that their product is below e.
+    """
+    few = np.flatnonzero(np.linalg.det(V) < tolerance * np.e)
+    return few, V[few]
+
+
 def _roots(system: ReducedSystem, e: int) -> Roots:
     """Find the badly conditioned landmarks of a group, and the roots of their inverses."""
     eliminated = system.layout.eliminated[e]
     V, size = scaled_blocks(system.equations.V[e].reshape(-1, eliminated.dof, eliminated.dof))
-    # the other n - 1 eigenvalues sum up to n at most, so that their product is below e
-    few = np.flatnonzero(np.linalg.det(V) < ILL_CONDITIONED * np.e)
-    values, vectors = np.linalg.eigh(V[few])
+    few, blocks = badly_conditioned(V, ILL_CONDITIONED)
+    values, vectors = np.linalg.eigh(blocks)
     ill = values[:, 0] < ILL_CONDITIONED
     few, values, vectors = few[ill], values[ill], vectors[ill]
     determined = values > LANDMARK_TOLERANCE

@@ -44,7 +44,7 @@ def camera_findings(inspection: Inspection, reported: set[tuple[str, int]]) -> l
 def _faint(inspection: Inspection, name: str, known: BoolArray) -> Finding | None:
     if not any(member.group == name for kept in inspection.layout.kept for member in kept.members):
         return None
-    information, held = inspection.information_of(name)
+    information, held, _ = inspection.information_of(name)
     free = ~held.any(axis=1)
     if not free.any():
         return None

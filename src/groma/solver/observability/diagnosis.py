@@ -30,6 +30,7 @@ from groma.problem.lay_out import lay_out
 from groma.problem.linearization import NormalEquations, to_solver_order
 from groma.problem.parallel import Workers
 from groma.problem.problem import Problem
+from groma.problem.tied import with_tied_apart
 from groma.solver.linear.blas import one_blas_thread
 from groma.solver.linear.elimination import eliminate as eliminate_landmarks
 from groma.solver.linear.schur import ReducedSystem
@@ -107,7 +108,8 @@ def diagnose(
         Findings as sentences and as data.
     """
     begin = time.perf_counter()
-    layout = lay_out(problem, eliminate)
+    parts = with_tied_apart(problem, eliminate)
+    layout = lay_out(parts.problem, eliminate)
     workers = Workers(threads)
     try:
         states = to_solver_order(layout)
@@ -117,7 +119,7 @@ def diagnose(
         eliminate_landmarks(system)
         system.assemble(0.0)
         with one_blas_thread():
-            return _diagnosis(Inspection(problem, layout, equations, system, names or _plain_name), begin)
+            return _diagnosis(Inspection(problem, parts, layout, equations, system, names or _plain_name), begin)
     finally:
         workers.close()
 
@@ -133,13 +135,11 @@ def _diagnosis(inspection: Inspection, begin: float) -> Diagnosis:
     moves: dict[tuple[str, int], FloatArray] = {}
     words: list[str] = []
     free, num_unobservable, reported = 0, 0, set()
-    for e in range(len(inspection.layout.eliminated)):
-        _eliminated(inspection, e, findings, weakness, moves)
-    for kept in inspection.layout.kept:
-        for member in kept.members:
-            if inspection.problem.variables[member.group].manifold.kind in ("point", "line"):
-                information, held = inspection.information_of(member.group)
-                findings += _landmarks(inspection, member.group, information, held, None, weakness)
+    for eliminated in inspection.layout.eliminated:
+        if eliminated.group not in inspection.landmarks:
+            _alone(inspection, eliminated.group, weakness, moves)
+    for name in inspection.landmarks:
+        findings += _landmarks(inspection, name, weakness)
     if inspection.layout.kept:
         free = inspection.free_motions[0].shape[1]
         words = scene_freedom(inspection.free_motions[0])
@@ -167,26 +167,12 @@ def _diagnosis(inspection: Inspection, begin: float) -> Diagnosis:
     return Diagnosis(tuple(words), free, num_unobservable, tuple(findings), weakness, time.perf_counter() - begin)
 
 
-def _eliminated(
-    inspection: Inspection,
-    e: int,
-    findings: list[Finding],
-    weakness: dict[str, FloatArray],
-    moves: dict[tuple[str, int], FloatArray],
+def _alone(
+    inspection: Inspection, name: str, weakness: dict[str, FloatArray], moves: dict[tuple[str, int], FloatArray]
 ) -> None:
-    """Look at a group that is eliminated: landmarks, or whatever else is solved on its own."""
-    eliminated = inspection.layout.eliminated[e]
-    name, dof = eliminated.group, eliminated.dof
-    group = inspection.problem.variables[name]
-    information, inverse = np.empty((2, eliminated.count, dof, dof))
-    information[eliminated.order] = inspection.equations.V[e].reshape(-1, dof, dof)
-    inverse[eliminated.order] = inspection.system.N[e].reshape(-1, dof, dof)
-    held = np.empty((eliminated.count, dof), bool)
-    held[eliminated.order] = inspection.held[1][e].reshape(-1, dof)
-    if group.manifold.kind in ("point", "line"):
-        findings += _landmarks(inspection, name, information, held, -inverse, weakness)
-        return
-    J = inspection.motion_of(name)
+    """Look at a group that is no landmarks and solved on its own."""
+    group, J = inspection.problem.variables[name], inspection.motion_of(name)
+    information, held, _ = inspection.information_of(name)
     sigma, directions = weakest(_with_held(information, held), J)
     for i in np.flatnonzero(sigma[:, 0] > DIAGNOSIS.undetermined):
         moves[name, int(i)] = directions[i] * np.minimum(sigma[i], DIAGNOSIS.largest_motion)
@@ -194,29 +180,20 @@ def _eliminated(
         weakness[name] = sigma[:, 0]
 
 
-def _landmarks(
-    inspection: Inspection,
-    name: str,
-    information: FloatArray,
-    held: BoolArray,
-    inverse: FloatArray | None,
-    weakness: dict[str, FloatArray],
-) -> list[Finding]:
-    """Judge points or lines by the information on each with the cameras held, and its inverse if there is one."""
-    group, dof = inspection.problem.variables[name], information.shape[1]
+def _landmarks(inspection: Inspection, name: str, weakness: dict[str, FloatArray]) -> list[Finding]:
+    """Judge points or lines by the information on each with the cameras held, and its inverse where there is one."""
+    group = inspection.problem.variables[name]
+    information, held, inverse = inspection.information_of(name)
     seen = observers(inspection.problem, name, inspection.centers)
-    sigma = np.full(len(group), np.inf)
-    unsure = np.ones(len(group), bool)
-    if inverse is not None:
-        # the root of the summed variances bounds the largest; where that is small, nothing more needs to be known
-        if group.manifold.basis(group.state) is None:
-            variance = np.einsum("nii->n", inverse) / seen.distance**2
-        else:
-            J = motion(group.manifold, group.state, seen.middle, seen.distance)
-            variance = np.einsum("nij,nij->n", J @ inverse, J)
-        sigma = np.sqrt(np.maximum(variance, 0.0))
-        rank = np.einsum("nij,nji->n", information, inverse)  # less where the elimination dropped a direction
-        unsure = ~(sigma < DIAGNOSIS.weak) | (rank < dof - 0.5) | held.any(axis=1)
+    # the root of the summed variances bounds the largest; where that is small, nothing more needs to be known
+    if group.manifold.basis(group.state) is None:
+        variance = np.einsum("nii->n", inverse) / seen.distance**2
+    else:
+        J = motion(group.manifold, group.state, seen.middle, seen.distance)
+        variance = np.einsum("nij,nij->n", J @ inverse, J)
+    sigma = np.sqrt(np.maximum(variance, 0.0))
+    rank = np.einsum("nij,nji->n", information, inverse)  # less where the elimination dropped a direction
+    unsure = ~(sigma < DIAGNOSIS.weak) | (rank < information.shape[1] - 0.5) | held.any(axis=1)
     num_unobservable = np.zeros(len(group), np.int64)
     if unsure.any():
         J = motion(group.manifold, group.state[unsure], seen.middle[unsure], seen.distance[unsure])

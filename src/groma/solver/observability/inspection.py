@@ -20,6 +20,7 @@ from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations
 from groma.problem.problem import Problem
 from groma.problem.residuals import squared_norms
+from groma.problem.tied import Divided
 from groma.solver.covariance.datum import FREE_TOLERANCE, free_motions, held_coordinates, middle_and_extent, unmoved
 from groma.solver.linear.blocks import multiply
 from groma.solver.linear.schur import ReducedSystem
@@ -33,6 +34,8 @@ class Inspection:
     """A problem, its linearisation at its states, and what is derived from both where it is needed."""
 
     problem: Problem
+    #: The same with landmarks that are tied to others apart, and how that is laid out.
+    parts: Divided
     layout: Layout
     equations: NormalEquations
     #: Undamped, with the landmarks eliminated.
@@ -96,7 +99,7 @@ class Inspection:
         for c in self.layout.kept:
             blocks = G[c.start : c.start + c.count * c.width].reshape(c.count, c.width, 7)
             for member in c.members:
-                group = self.problem.variables[member.group]
+                group = self.layout.problem.variables[member.group]
                 part = gauge_directions(group.manifold, group.state, center, length, member.group in mounted)
                 rows = member.blocks(np.arange(len(group)))
                 blocks[rows, member.offset : member.offset + member.dof] = part.transpose(1, 2, 0)
@@ -123,16 +126,36 @@ class Inspection:
                 np.add.at(total, refs["plane"].index, 1.0)
         return np.where(total[:, None] > 0, sums / np.maximum(total, 1.0)[:, None], self.place_and_size[0])
 
-    def information_of(self, name: str) -> tuple[FloatArray, BoolArray]:
-        """Information (count, dof, dof) on kept variables with all others held, and what is held of each."""
-        for c, kept in enumerate(self.layout.kept):
-            for member in kept.members:
-                if member.group == name:
-                    rows = member.blocks(np.arange(len(self.problem.variables[name])))
-                    part = slice(member.offset, member.offset + member.dof)
-                    held = self.held[0][c].reshape(kept.count, kept.width)[rows, part]
-                    return self.system.S[c, c][rows, part, part], held
-        raise KeyError(name)
+    def information_of(self, name: str) -> tuple[FloatArray, BoolArray, FloatArray]:
+        """Information (count, dof, dof) on variables with the kept ones held, what is held of each, and the inverse.
+
+        The inverse is NaN for those that are kept themselves.
+        """
+        group = self.problem.variables[name]
+        free, dof = group.free_coordinates(), group.manifold.dof
+        information = np.zeros((len(group), dof, dof))
+        inverse = np.full_like(information, np.nan)
+        for part, mine in self.parts.parts(name):
+            for e, eliminated in enumerate(self.layout.eliminated):
+                if eliminated.group == part:
+                    rows = mine[eliminated.order]
+                    information[rows] = self.equations.V[e].reshape(-1, dof, dof)
+                    inverse[rows] = -self.system.N[e].reshape(-1, dof, dof)
+            for c, member in ((c, member) for c, kept in enumerate(self.layout.kept) for member in kept.members):
+                if member.group == part:
+                    own = slice(member.offset, member.offset + dof)
+                    information[mine] = self.system.S[c, c][member.blocks(np.arange(len(mine))), own, own]
+        return information, np.zeros((len(group), dof), bool) if free is None else ~free, inverse
+
+    @cached_property
+    def landmarks(self) -> list[str]:
+        """Groups of points and lines that may move."""
+        free = {e.group for e in self.layout.eliminated} | {m.group for c in self.layout.kept for m in c.members}
+        return [
+            name
+            for name, group in self.problem.variables.items()
+            if group.manifold.kind in ("point", "line") and any(part in free for part, _ in self.parts.parts(name))
+        ]
 
     @cached_property
     def squares(self) -> list[FloatArray]:

@@ -31,7 +31,7 @@ def separate_parts(inspection: Inspection) -> list[Finding]:
     label = connected_parts(rows, columns, int(first[-1]))
     for c, kept in enumerate(layout.kept):
         group = kept.members[0].group
-        if inspection.problem.variables[group].manifold.kind != "pose":
+        if layout.problem.variables[group].manifold.kind != "pose":
             continue
         seen = inspection.system.diagonal(c).sum(axis=1) > 0
         sizes = np.bincount(label[first[c] : first[c + 1]][seen])
@@ -53,13 +53,14 @@ def unseen_variables(inspection: Inspection) -> tuple[list[Finding], set[tuple[s
     for c in inspection.layout.kept:
         blocks = unseen[c.start : c.start + c.count * c.width].reshape(c.count, c.width)
         for member in c.members:
-            group = inspection.problem.variables[member.group]
+            group = inspection.layout.problem.variables[member.group]
             rows = member.blocks(np.arange(len(group)))
             bad = np.flatnonzero(blocks[rows, member.offset : member.offset + member.dof].all(axis=1))
             if len(bad) == 0:
                 continue
-            found |= {(member.group, int(i)) for i in bad}
-            what, one = first_upper(few([inspection.names(member.group, int(i)) for i in bad])), len(bad) == 1
+            whole = [inspection.parts.whole(member.group, int(i)) for i in bad]
+            found |= {*whole}
+            what, one = first_upper(few([inspection.names(*variable) for variable in whole])), len(bad) == 1
             if group.manifold.kind in ("plane", "direction"):
                 use = "lies on" if group.manifold.kind == "plane" else "runs along"
                 text = f"Nothing {use} {what[:1].lower()}{what[1:]}: {'it takes' if one else 'they take'} no part."
@@ -67,7 +68,7 @@ def unseen_variables(inspection: Inspection) -> tuple[list[Finding], set[tuple[s
             else:
                 text = f"{what} {'has' if one else 'have'} no observations at all."
                 severity, code = "problem", "no_observations"
-            findings.append(Finding(code, severity, text, member.group, tuple(map(int, bad))))
+            findings.append(Finding(code, severity, text, whole[0][0], tuple(i for _, i in whole)))
     return findings, found
 
 
@@ -149,7 +150,7 @@ def _excursions(inspection: Inspection, modes: Modes, size: FloatArray) -> dict[
     steps[np.concatenate(inspection.held[0])] = 0.0  # ones on the diagonal say nothing in any unit
     result = {}
     for c in inspection.layout.kept:
-        if inspection.problem.variables[c.members[0].group].manifold.kind in ("point", "line"):
+        if inspection.layout.problem.variables[c.members[0].group].manifold.kind in ("point", "line"):
             continue
         blocks = steps[c.start : c.start + c.count * c.width].reshape(c.count, c.width, -1)
         for member in c.members:

@@ -14,6 +14,7 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.geometry import se3
 from groma.solver.report import SolveReport
+from groma.tracking.backend.behind import OnDemand
 from groma.tracking.backend.depth_calibration import DepthOffset, correct_depths, estimate_depth_offset
 from groma.tracking.backend.local_adjustment import AdjustmentJob, job_of, window_job
 from groma.tracking.backend.loop_closure import LoopSearch, search_for_loop
@@ -32,12 +33,12 @@ from groma.tracking.map.planes import merge_planes
 from groma.tracking.map.relations import find_lines_on_planes
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.options import TrackOptions
-from groma.tracking.pose.following import carry
+from groma.tracking.pose.following import carry, find_points_again
 from groma.tracking.result import map_to_scene
 from groma.tracking.stopwatch import Stopwatch
 
 #: A chosen frame becomes a keyframe, and the result of a window's adjustment is taken up, after this many frames.
-DELAY = 2
+READY, DELAY = 2, 2
 
 
 @dataclass
@@ -66,17 +67,10 @@ class _Chosen:
         return self.age >= delay
 
 
-class _OnDemand:
-    """Stands for a future where there are no threads: the work is done when its result is asked for."""
-
-    def __init__(self, work: Callable[[], Any]) -> None:
-        self.result = work
-
-
 @dataclass
 class _Pending:
     job: AdjustmentJob
-    future: Future | _OnDemand
+    future: Future | OnDemand
     due: int
 
 
@@ -114,7 +108,7 @@ class Mapper:
         #: For what belongs to a frame, which keyframes must not hold up.
         self.frame_pool = ThreadPoolExecutor(1, thread_name_prefix="groma-frame") if options.threaded else None
         self._pending: _Pending | None = None
-        self._search: tuple[LoopSearch, Future | _OnDemand] | None = None
+        self._search: tuple[LoopSearch, Future | OnDemand] | None = None
 
     @property
     def map(self) -> TrackMap:
@@ -157,12 +151,24 @@ class Mapper:
         """Whether a window is being adjusted."""
         return self._pending is not None
 
-    def advance(self, present: Present, watch: Stopwatch) -> None:
-        """Before each frame: take up results that are due, and make the chosen keyframe if it is."""
+    def advance(self, present: Present, at_once: bool = False) -> Stopwatch:
+        """Between two frames: take up results and make the keyframe that are due, or one of the present frame
+        at once.
+
+        Returns where the time went.
+        """
+        watch = Stopwatch()
+        if at_once:
+            assert present.data is not None
+            with watch("again"):
+                present.followed = find_points_again(self.map, present.data, present.pose, present.followed)
+            self.choose(present, present.data)
+            self.make_keyframe(present, watch)
         with watch("take up"):
             self.take_up(present)
-        if self.due is not None and self.due.is_ready(DELAY if self.metric else 1):
+        if self.due is not None and self.due.is_ready(READY if self.metric else 1):
             self.make_keyframe(present, watch)
+        return watch
 
     def adjust_start(self, present: Present) -> None:
         """Adjust the first keyframes of a single camera."""
@@ -181,7 +187,10 @@ class Mapper:
         self.due = _Chosen(data, near.index, relative, present.followed)
 
     def keep_present(self, present: Present, watch: Stopwatch) -> None:
-        """Make a keyframe of the present frame, unless one stands for it, and take up all that is being worked out."""
+        """Make a keyframe of the present frame, unless one stands for it, and take up all that is being worked out.
+
+        Before its window is adjusted, a keyframe that was found by features alone leads the next one astray.
+        """
         if self.due is not None:
             self.make_keyframe(present, watch)
         if present.frames_since_keyframe > 0:
@@ -196,7 +205,7 @@ class Mapper:
         """Make a keyframe of the frame that was chosen."""
         assert self.due is not None
         chosen, self.due = self.due, None
-        with watch("wait"):
+        with watch("features"):
             chosen.data.wait()
         with watch("take up"):
             self.take_up(present, now=True)
@@ -207,8 +216,9 @@ class Mapper:
                 present.followed = followed
             elif present.data is not None:
                 present.followed = carry(
-                    self.map, self.camera, chosen.data, present.data, followed, present.followed, present.pose
-                )
+                    self.map, self.camera, chosen.data, present.data, followed, present.followed, present.pose,
+                    self.frame_pool,
+                )  # fmt: skip
             merge_planes(self.map.planes, self.options.gates.planes)
             if self.options.relations:
                 find_lines_on_planes(self.map)
@@ -228,8 +238,8 @@ class Mapper:
             busy = self._pending.job.keyframes if self._pending else []
             drop_repeating_keyframes(self.map, busy, self.options.gates.culling)
 
-    def _begin(self, work: Callable[[], Any]) -> Future | _OnDemand:
-        return _OnDemand(work) if self._pool is None else self._pool.submit(work)
+    def _begin(self, work: Callable[[], Any]) -> Future | OnDemand:
+        return OnDemand(work) if self._pool is None else self._pool.submit(work)
 
     def take_up(self, present: Present, now: bool = False) -> None:
         """Take up the result of the thread when it is due."""

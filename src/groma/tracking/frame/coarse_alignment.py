@@ -8,18 +8,130 @@ counts only if the surroundings of the followed points then agree better than wh
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from groma._numba import kernel, loop
 from groma._typing import FloatArray
 from groma.geometry import quaternion, se3, so3
 from groma.tracking.frame.camera import TrackCamera, into, rotation
 from groma.tracking.gates import DEFAULT, TurnGates
 
 _SmallImage = npt.NDArray[np.float32]
+
+
+# ------------------------------------------------------------------------------------------------------------ Kernels
+
+
+@kernel
+def _grey(image, x, y):
+    """Grey level at a place inside an image, between four pixels."""
+    i, j = min(int(y), image.shape[0] - 2), min(int(x), image.shape[1] - 2)
+    fx, fy = x - j, y - i
+    top = image[i, j] * (1.0 - fx) + image[i, j + 1] * fx
+    bottom = image[i + 1, j] * (1.0 - fx) + image[i + 1, j + 1] * fx
+    return top * (1.0 - fy) + bottom * fy
+
+
+@loop
+def _turn_image(before, K, turn, moved, seen):
+    """Write an image as a camera sees it after a turn, and which pixels and neighbours it shows."""
+    height, width = before.shape
+    for i in range(height):
+        for j in range(width):
+            x, y = (j - K[0, 2]) / K[0, 0], (i - K[1, 2]) / K[1, 1]
+            z = turn[0, 2] * x + turn[1, 2] * y + turn[2, 2]
+            u = K[0, 0] * (turn[0, 0] * x + turn[1, 0] * y + turn[2, 0]) / z + K[0, 2]
+            v = K[1, 1] * (turn[0, 1] * x + turn[1, 1] * y + turn[2, 1]) / z + K[1, 2]
+            shown = z > 0.0 and 0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0
+            moved[i, j] = _grey(before, u, v) if shown else np.nan
+    for i in range(1, height - 1):
+        for j in range(1, width - 1):
+            seen[i, j] = not math.isnan(moved[i - 1 : i + 2, j - 1 : j + 2].sum())
+
+
+@loop
+def _compare(before, now, K, turn, outlier, H, gradient):
+    """Write the normal equations of a small left turn; return the share of the image that is seen, and correlation."""
+    height, width = now.shape
+    moved, seen = np.empty((height, width)), np.zeros((height, width), np.bool_)
+    _turn_image(before, K, turn, moved, seen)
+    count, a, b, aa, bb, ab = 0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(height):
+        for j in range(width):
+            if seen[i, j]:
+                one, two = moved[i, j], float(now[i, j])
+                count, a, b = count + 1, a + one, b + two
+                aa, bb, ab = aa + one * one, bb + two * two, ab + one * two
+    H[:], gradient[:] = 0.0, 0.0
+    if count == 0:
+        return 0.0, -1.0
+    a, b = a / count, b / count
+    score = (ab - count * a * b) / max(math.sqrt((aa - count * a * a) * (bb - count * b * b)), 1e-9)
+    # The median difference, to an eighth of a grey level.
+    of_size = np.zeros(4096, np.int64)
+    for i in range(height):
+        for j in range(width):
+            if seen[i, j]:
+                of_size[min(int(8.0 * abs(moved[i, j] - a - now[i, j] + b)), 4095)] += 1
+    median, below = 0, of_size[0]
+    while 2 * below < count:
+        median += 1
+        below += of_size[median]
+    limit = max(outlier * 0.125 * median, 1.0)
+    J = np.empty(3)
+    for i in range(height):
+        for j in range(width):
+            if not seen[i, j]:
+                continue
+            # Pixels by a small left turn of the camera: d(x, y) = (-x y, 1 + x^2, -y; -1 - y^2, x y, x) d omega.
+            # Content moves forward, so the value at a pixel changes by the gradient against the motion.
+            up, down = moved[i - 1], moved[i + 1]
+            middle = 2.0 * (moved[i, j + 1] - moved[i, j - 1])
+            along_u = -0.125 * K[0, 0] * (up[j + 1] - up[j - 1] + middle + down[j + 1] - down[j - 1])
+            middle = 2.0 * (down[j] - up[j])
+            along_v = -0.125 * K[1, 1] * (down[j - 1] - up[j - 1] + middle + down[j + 1] - up[j + 1])
+            x, y = (j - K[0, 2]) / K[0, 0], (i - K[1, 2]) / K[1, 1]
+            J[0] = -along_u * x * y - along_v * (1.0 + y * y)
+            J[1] = along_u * (1.0 + x * x) + along_v * x * y
+            J[2] = -along_u * y + along_v * x
+            error = moved[i, j] - a - now[i, j] + b
+            weight = 1.0 / (1.0 + (error / limit) ** 2)
+            for k in range(3):
+                gradient[k] += weight * J[k] * error
+                for m in range(3):
+                    H[k, m] += weight * J[k] * J[m]
+    return count / (height * width), score
+
+
+@loop
+def _correlate(before, now, first, second, noise, each):
+    """Write the correlation of the 5 x 5 surroundings of places in both images; return that of all together."""
+    height, width = before.shape
+    patch = np.empty((2, 25))
+    all_aa, all_bb, all_ab = noise, noise, 0.0
+    for k in range(first.shape[0]):
+        for n in range(25):
+            du, dv = float(n % 5 - 2), float(n // 5 - 2)
+            u, v = min(max(first[k, 0] + du, 0.0), width - 1.0), min(max(first[k, 1] + dv, 0.0), height - 1.0)
+            patch[0, n] = _grey(before, u, v)
+            u, v = min(max(second[k, 0] + du, 0.0), width - 1.0), min(max(second[k, 1] + dv, 0.0), height - 1.0)
+            patch[1, n] = _grey(now, u, v)
+        mean_a, mean_b = patch[0].mean(), patch[1].mean()
+        aa, bb, ab = 0.0, 0.0, 0.0
+        for n in range(25):
+            a, b = patch[0, n] - mean_a, patch[1, n] - mean_b
+            aa, bb, ab = aa + a * a, bb + b * b, ab + a * b
+        each[k] = ab / math.sqrt((aa + noise) * (bb + noise))
+        all_aa, all_bb, all_ab = all_aa + aa, all_bb + bb, all_ab + ab
+    return all_ab / math.sqrt(all_aa * all_bb)
+
+
+# ------------------------------------------------------------------------------------------------------------- Public
 
 
 def small_image(gray: npt.NDArray[np.uint8], gates: TurnGates = DEFAULT.turns) -> _SmallImage:
@@ -85,35 +197,15 @@ def _align(
 
     One step tells how well they agree at the start.
     """
-    height, width = now.shape
-    inverse = np.linalg.inv(K)
-    v, u = np.mgrid[0:height, 0:width].reshape(2, -1)
-    x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
-    # Pixels by a small left turn of the camera: d(x, y) = (-x y, 1 + x^2, -y; -1 - y^2, x y, x) d omega.
-    along_u = K[0, 0] * np.stack([-x * y, 1.0 + x * x, -y], axis=1)
-    along_v = K[1, 1] * np.stack([-1.0 - y * y, x * y, x], axis=1)
-    inside = np.ones(before.shape, np.uint8)
     turn, best, best_score = start, start, -np.inf
+    H, gradient = np.zeros((3, 3)), np.zeros(3)
     for _ in range(steps):
-        homography = K @ turn @ inverse
-        moved = cv2.warpPerspective(before, homography, (width, height), flags=cv2.INTER_LINEAR)
-        both = cv2.warpPerspective(inside, homography, (width, height), flags=cv2.INTER_NEAREST)
-        seen = np.asarray(cv2.erode(both, np.ones((3, 3), np.uint8))).ravel() > 0
-        if seen.sum() < gates.min_overlap * seen.size:
+        share, score = _compare(before, now, K, turn, gates.outlier, H, gradient)
+        if share < gates.min_overlap:
             break
-        a, b = np.asarray(moved, np.float64).ravel()[seen], now.ravel()[seen].astype(np.float64)
-        a, b = a - a.mean(), b - b.mean()
-        score = float((a @ b) / max(np.sqrt((a @ a) * (b @ b)), 1e-9))
         if score > best_score:
             best, best_score = turn, score
-        # Content moves forward, so the value at a pixel changes by the gradient against the motion.
-        gradient = [0.125 * np.asarray(cv2.Sobel(moved, cv2.CV_32F, *of)).ravel()[seen] for of in ((1, 0), (0, 1))]
-        J = -(gradient[0][:, None] * along_u[seen] + gradient[1][:, None] * along_v[seen])
-        size = np.abs(a - b)
-        weight = 1.0 / (1.0 + (size / max(gates.outlier * float(np.median(size)), 1.0)) ** 2)
-        weighted = weight[:, None] * J
-        H = weighted.T @ J
-        omega = -np.linalg.solve(H + 1e-6 * (np.trace(H) + 1.0) * np.eye(3), weighted.T @ (a - b))
+        omega = -np.linalg.solve(H + 1e-6 * (np.trace(H) + 1.0) * np.eye(3), gradient)
         turn = so3.exp(omega[None])[0] @ turn
         if np.abs(omega).max() * K[0, 0] < gates.converged:
             break
@@ -138,20 +230,10 @@ def surroundings_agree(
         inside = ((guesses >= 0) & (guesses <= (shape[1], shape[0]))).all(axis=1)
     if 4 * inside.sum() < len(pixels):
         return -1.0, -1.0
-    offset = np.stack(np.meshgrid([-2, -1, 0, 1, 2], [-2, -1, 0, 1, 2]), axis=-1).reshape(1, -1, 2).astype(np.float32)
     scale = np.array([width / shape[1], height / shape[0]])
-    patches = []
-    for image, places in ((before, pixels[inside]), (now, guesses[inside])):
-        at = (places * scale - 0.5)[:, None].astype(np.float32) + offset
-        values = cv2.remap(
-            image, np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1]), cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )  # fmt: skip
-        patches.append(np.asarray(values, np.float64))
-    a, b = (patch - patch.mean(axis=1, keepdims=True) for patch in patches)
-    aa, bb, ab = (a * a).sum(axis=1), (b * b).sum(axis=1), (a * b).sum(axis=1)
-    each = ab / np.sqrt((aa + noise) * (bb + noise))
-    return float(np.median(each)), float(ab.sum() / np.sqrt((aa.sum() + noise) * (bb.sum() + noise)))
+    each = np.zeros(int(inside.sum()))
+    together = _correlate(before, now, pixels[inside] * scale - 0.5, guesses[inside] * scale - 0.5, noise, each)
+    return float(np.median(each)), float(together)
 
 
 def turned(

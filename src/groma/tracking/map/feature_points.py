@@ -5,12 +5,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.tracking.frame.camera import TrackCamera
-from groma.tracking.frame.features import Descriptors, Features
+from groma.tracking.frame.descriptor_pairs import pair_anywhere
+from groma.tracking.frame.features import Features
 from groma.tracking.frame.measurements import PointMeasurements
 from groma.tracking.map.landmarks import ALIVE, DEAD
 from groma.tracking.map.points import PointTracks
@@ -20,17 +20,8 @@ from groma.tracking.options import TrackOptions
 
 
 def match_features(first: Features, second: Features, max_bits: int) -> tuple[IntArray, IntArray]:
-    """Pair features whose descriptors are nearest to each other, both ways, and differ in at most so many bits."""
-    return match_descriptors(first.descriptor, second.descriptor, max_bits)
-
-
-def match_descriptors(first: Descriptors, second: Descriptors, max_bits: int) -> tuple[IntArray, IntArray]:
-    """Pair descriptors likewise; return the rows of both."""
-    if not len(first) or not len(second):
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(first, second)
-    pairs = [pair for pair in pairs if pair.distance <= max_bits]
-    return np.array([p.queryIdx for p in pairs], np.int64), np.array([p.trainIdx for p in pairs], np.int64)
+    """Pair features whose descriptors are nearest and differ in at most so many bits; return the rows of both."""
+    return pair_anywhere(first.descriptor, second.descriptor, max_bits)
 
 
 def points_of_features(

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import partial
@@ -14,7 +15,7 @@ from groma.features.point_tracks import follow
 from groma.tracking.frame.camera import TrackCamera, into
 from groma.tracking.frame.features import FrameFeatures
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
-from groma.tracking.map.keyframes import Followed, measure_points
+from groma.tracking.map.keyframes import Followed, keyframe_nearby, measure_points
 from groma.tracking.map.landmarks import DEAD
 from groma.tracking.map.lines import FollowedSegments, carried, coarse_flow, expected_segments, measured_edges
 from groma.tracking.map.points import PointTracks, find_again, follow_points
@@ -50,8 +51,8 @@ def follow_frame(
     """Return the pose of a frame that follows another, and what is still followed; lines beside points in a pool."""
     camera, options, gates = data.camera, data.options, data.options.gates
     tracks, segments = followed.points, followed.lines
-    of_lines = partial(follow_lines, track_map, before, data, segments)
-    following = pool.submit(of_lines) if pool is not None and options.lines and len(segments.index) else None
+    with_lines = options.lines and len(segments.index) > 0
+    lines_followed = _beside(pool if with_lines else None, partial(follow_lines, track_map, before, data, segments))
     with watch("points"):
         tracks = tracks.take(track_map.points.state[tracks.index] != DEAD)
         if options.points:
@@ -65,9 +66,8 @@ def follow_frame(
             measured = PointMeasurements.empty()
     with watch("lines"):
         lines = LineMeasurements.empty()
-        if options.lines and len(segments.index):
-            # What no thread has begun yet is done here.
-            segments = of_lines() if following is None or following.cancel() else following.result()
+        if with_lines:
+            segments = lines_followed()
             lines = measure_lines(track_map, data, segments, few_points=len(measured) < gates.lines.few_points)
     with watch("planes"):
         planes = PlaneMeasurements.empty()
@@ -102,6 +102,22 @@ def find_points_again(track_map: TrackMap, data: FrameFeatures, pose: FloatArray
     return Followed(followed.points.joined(found), followed.lines)
 
 
+def follow_nearby(track_map: TrackMap, data: FrameFeatures, pose: FloatArray, followed: Followed) -> Followed | None:
+    """Follow an older keyframe that stands for a pose; None unless there is one, still seen well."""
+    options = data.options
+    keyframe = keyframe_nearby(track_map, pose, options)
+    if keyframe is None:
+        return None
+    track_map.visit(keyframe)
+    found = find_again(
+        track_map, data.camera, data.gray, pose, followed.points, options.num_points, options.gates.points
+    )
+    points = followed.points.joined(found)
+    seen = np.isin(keyframe.measured.points.index, points.index).sum()
+    enough = seen >= options.keyframe_share * len(keyframe.measured.points)
+    return Followed(points, followed.lines) if enough else None
+
+
 def carry(
     track_map: TrackMap,
     camera: TrackCamera,
@@ -110,9 +126,13 @@ def carry(
     new: Followed,
     followed: Followed,
     pose: FloatArray,
+    pool: Executor | None = None,
 ) -> Followed:
     """Follow what a frame added to the map to a later frame, which was followed without it; return both together."""
     points, lines = new.points, new.lines
+    lines = lines.take(~np.isin(lines.index, followed.lines.index))
+    with_lines = len(lines.index) > 0
+    lines_followed = _beside(pool if with_lines else None, partial(follow_lines, track_map, before, data, lines))
     points = points.take(~np.isin(points.index, followed.points.index))
     place = into(pose, track_map.points.xyz[points.index])
     expected = camera.project(place)
@@ -122,10 +142,13 @@ def carry(
     inside = np.flatnonzero(camera.inside(guess, 2.0))
     pixel, good = follow(before.gray, data.gray, points.pixel[inside], guess[inside], levels=2)
     points = PointTracks(points.index[inside[good]], pixel[good])
-    lines = lines.take(~np.isin(lines.index, followed.lines.index))
-    if len(lines.index):
-        lines = follow_lines(track_map, before, data, lines)
-    return Followed(followed.points.joined(points), followed.lines.joined(lines))
+    return Followed(followed.points.joined(points), followed.lines.joined(lines_followed() if with_lines else lines))
+
+
+def _beside(pool: Executor | None, work: Callable[[], FollowedSegments]) -> Callable[[], FollowedSegments]:
+    """Begin with some work in another thread; return what gives its result. What none has begun yet is done there."""
+    begun = None if pool is None else pool.submit(work)
+    return lambda: work() if begun is None or begun.cancel() else begun.result()
 
 
 def follow_lines(

@@ -20,17 +20,17 @@ from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import propose, straightened
 from groma.localization.pose.matches import Matches
 from groma.tracking.frame.camera import TrackCamera, back, into
+from groma.tracking.frame.descriptor_pairs import pair_anywhere, pair_near
 from groma.tracking.frame.features import Descriptors, Features, FrameFeatures
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
 from groma.tracking.gates import DEFAULT
-from groma.tracking.map.feature_points import match_descriptors, points_of_features
+from groma.tracking.map.feature_points import points_of_features
 from groma.tracking.map.landmarks import ALIVE
 from groma.tracking.map.lines import FollowedSegments, assign, expected_segments
 from groma.tracking.map.planes import assign_planes
 from groma.tracking.map.points import PointTracks
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.pose.estimate import LOSSES, PoseEstimate, estimate_pose, rough_pose
-from groma.tracking.pose.near_matches import pair_near
 
 
 @dataclass(frozen=True)
@@ -210,9 +210,7 @@ class _Search:
             rows, columns = np.delete(rows, self.known.row[mine[:, 0]]), np.delete(columns, mine[:, 1])
         if min(len(rows), len(columns)) <= agreeing:
             return None
-        one, other = match_descriptors(
-            first.descriptor[rows], second.descriptor[columns], self.all_gates.features.max_bits
-        )
+        one, other = pair_anywhere(first.descriptor[rows], second.descriptor[columns], self.all_gates.features.max_bits)
         places = feature_places(self.track_map, self.camera, keyframe, rows[one])
         known = np.isfinite(places[:, 0])
         if known.sum() <= agreeing:

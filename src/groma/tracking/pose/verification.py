@@ -106,6 +106,25 @@ class PoseVerification:
         _, through = depth_agreement(self.camera, keyframes, data.depth_grid, pose, self.options.gates)
         return through > self.options.gates.depth_check.denies
 
+    def find(
+        self,
+        track_map: TrackMap,
+        data: FrameFeatures,
+        guesses: list[FloatArray],
+        predicted: FloatArray,
+        prior_sigma: FloatArray,
+        lost_for: int,
+    ) -> Found | None:
+        """Find a frame by described features: near the last keyframes first, then anywhere."""
+        if lost_for <= self.gates.lost_frames:
+            found = self.find_near(track_map, data, guesses, predicted, prior_sigma)
+            if found is not None:
+                return found
+        found = self.find_anywhere(track_map, data)
+        if found is None or lost_for > self.gates.lost_frames:
+            return found
+        return found if self.is_near(found.estimate.pose, predicted, prior_sigma) else None
+
     def find_near(
         self,
         track_map: TrackMap,

@@ -71,23 +71,23 @@ def num_expected(tracks: Tracks, neighbors: list[IntArray], size: IntArray, min_
     reach = tracks.lines_near_images(neighbors)
     bound = np.where(size > 0, size, np.inf)
     count = np.zeros(tracks.num_lines, np.int64)
-    work = list(zip(tracks.views.camera, reach, bound, strict=True))
-    for shown in map_work(partial(_shown_in, tracks.lines, min_length), work):
-        count[shown] += 1
+    work = [(P, tracks.lines[lines], limit) for P, lines, limit in zip(tracks.views.camera, reach, bound, strict=True)]
+    for lines, shown in zip(reach, map_work(partial(_shown_in, min_length), work), strict=True):
+        count[lines[shown]] += 1
     return np.maximum(count, tracks.num_images())
 
 
-def _shown_in(ends: FloatArray, min_length: float, image: tuple[FloatArray, IntArray, FloatArray]) -> IntArray:
-    """Lines, of those to look for, that an image with this camera and size should show."""
-    P, lines, limit = image
-    x = ends[lines] @ P[:, :3].T + P[:, 3]
+def _shown_in(min_length: float, image: tuple[FloatArray, FloatArray, FloatArray]) -> IntArray:
+    """Which of some lines an image with this camera and size should show."""
+    P, ends, limit = image
+    x = ends @ P[:, :3].T + P[:, 3]
     ahead = (x[..., 2] > 1e-6).all(1)
     pixel = x[ahead, :, :2] / x[ahead, :, 2:]
     along = pixel[:, 1] - pixel[:, 0]
     safe = np.where(np.abs(along) < 1e-9, 1e-9, along)
     both = np.sort([-pixel[:, 0] / safe, (limit - pixel[:, 0]) / safe], axis=0)
     length = (both[1].min(1).clip(max=1.0) - both[0].max(1).clip(0.0)) * np.linalg.norm(along, axis=1)
-    return lines[ahead][length >= min_length]
+    return np.flatnonzero(ahead)[length >= min_length]
 
 
 def edge_odds(

@@ -17,8 +17,9 @@ import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
-from groma.execution import map_work
+from groma.execution import map_work, num_calls
 from groma.mapping.groups import grouped
+from groma.mapping.lines.clusters import Cluster, clusters
 from groma.mapping.lines.hypotheses.consensus import choose
 from groma.mapping.lines.hypotheses.earlier import Known
 from groma.mapping.lines.hypotheses.proposals import WEAK, Proposer, Questions
@@ -104,19 +105,57 @@ def find_places(
     """
     points = _points_by_image(scene, views) if options.use_points else [None] * scene.num_images
     work = list(zip(range(len(neighbors)), neighbors, points, known or [None] * len(neighbors), strict=True))
-    found = map_work(partial(_places_in, Proposer(views, ratios, options), matches), work, progress)
+    proposer, calls = Proposer(views, ratios, options), num_calls()
+    if calls and matches is None:
+        parts = [_Part.of(cluster, proposer, work) for cluster in clusters(neighbors, calls, views)]
+        in_order = np.argsort(np.concatenate([part.cluster.images for part in parts]))
+        by_part = [place for places in map_work(_places_of, parts, progress) for place in places]
+        found = [by_part[place] for place in in_order]
+    else:
+        found = map_work(partial(_places_in, proposer, matches), work, progress)
     found = [Places.none(0, max(1, options.num_neighbors), Outcome.NO_MATCH), *found]
     columns = {item.name: np.concatenate([getattr(one, item.name) for one in found]) for item in fields(Places)}
     columns["rejection"][~views.usable] = Outcome.TOO_SHORT
     return Places(**columns)
 
 
+#: Of one image: its number, neighbours, known points, and what else is known.
+_Image = tuple[int, IntArray, tuple[FloatArray, FloatArray] | None, Known | None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """What is asked of the images of a cluster, in the numbers of the cluster: so much is sent to another process."""
+
+    cluster: Cluster
+    proposer: Proposer
+    images: list[_Image]
+
+    @staticmethod
+    def of(cluster: Cluster, proposer: Proposer, images: Sequence[_Image]) -> _Part:
+        """Take the part of a cluster out of the whole."""
+        mine = []
+        for i in cluster.images:
+            _, others, points, known = images[i]
+            if known is not None:
+                known = replace(known, supporters=cluster.row(known.supporters))
+            mine.append((int(cluster.image(i)), cluster.image(others), points, known))
+        views = cluster.views(proposer.views)
+        return _Part(cluster, replace(proposer, views=views, ratios=proposer.ratios[cluster.rows]), mine)
+
+
+def _places_of(part: _Part) -> list[Places]:
+    """The place of every segment of the images of a cluster."""
+    found = (_places_in(part.proposer, None, image) for image in part.images)
+    return [replace(places, supporters=part.cluster.whole(places.supporters)) for places in found]
+
+
 def _places_in(
     proposer: Proposer,
     matches: Mapping[tuple[int, int], LineMatches] | MatchProvider | None,
-    image: tuple[int, IntArray, tuple[FloatArray, FloatArray] | None, Known | None],
+    image: _Image,
 ) -> Places:
-    """The same of one image: its number, neighbours, known points, and what else is known."""
+    """The same of one image."""
     views, (i, others, points, known) = proposer.views, image
     rows, width = views.rows(i), max(1, proposer.options.num_neighbors)
     count = rows.stop - rows.start

@@ -120,12 +120,12 @@ def _on_lines(
 ) -> tuple[IntArray, FloatArray]:
     """Lines and segments on them (M, 2), in the images of the lines and their neighbours; and squared distances."""
     views, gates = tracks.views, (max_squared, AGREEMENT.min_overlap, tracks.gates.min_overlap_px)
-    segments = views.ends, sigma, views.usable
-    work = [
-        (views.camera[image], lines, np.arange(views.pointers[image], views.pointers[image + 1]))
-        for image, lines in enumerate(tracks.lines_near_images(neighbors))
-    ]
-    found = map_work(partial(_on_lines_in, tracks.lines, segments, forward, gates), work)
+    work = []  # of each image with its own segments and the lines near it alone: it may be sent to another process
+    for image, lines in enumerate(tracks.lines_near_images(neighbors)):
+        rows = views.rows(image)
+        segments = views.ends[rows], sigma[rows], views.usable[rows]
+        work.append((views.camera[image], lines, tracks.lines[lines], forward[lines], rows.start, segments))
+    found = map_work(partial(_on_lines_in, gates), work)
     return (
         np.concatenate([np.empty((0, 2), np.int64), *(hits for hits, _ in found)]),
         np.concatenate([np.empty(0), *(distances for _, distances in found)]),
@@ -133,19 +133,17 @@ def _on_lines(
 
 
 def _on_lines_in(
-    ends: FloatArray,
-    segments: tuple[np.ndarray, ...],
-    forward: FloatArray,
     gates: tuple[float, float, float],
-    image: tuple[FloatArray, IntArray, IntArray],
+    image: tuple[FloatArray, IntArray, FloatArray, FloatArray, int, tuple[FloatArray, FloatArray, BoolArray]],
 ) -> tuple[IntArray, FloatArray]:
-    """The same of one image: its camera, lines to look for, and rows of its segments."""
-    camera, lines, rows = image
+    """The same of one image: its camera, the lines to look for with their ends and directions, and its segments."""
+    camera, lines, ends, forward, first, segments = image
+    every = np.arange(len(lines)), np.arange(len(segments[0]))
     hits, distances = np.empty((4096, 2), np.int64), np.empty(4096)
     while True:
-        needed = find_on_lines(camera, ends, lines, rows, *segments, forward, *gates, hits, distances)
+        needed = find_on_lines(camera, ends, *every, *segments, forward, *gates, hits, distances)
         if needed <= len(hits):
-            return hits[:needed], distances[:needed]
+            return np.column_stack([lines[hits[:needed, 0]], first + hits[:needed, 1]]), distances[:needed]
         hits, distances = np.empty((needed, 2), np.int64), np.empty(needed)
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Two directions are parallel.
+r"""Two directions are parallel, or perpendicular.
 
 Of a line the direction d takes part, of a plane the normal n, and a vanishing direction is one itself. With unit
-vectors
+vectors, *parallel* is
 
 .. math:: r = \hat d_1 \times \hat d_2, \quad
           \frac{\partial r}{\partial d_1} = -[\hat d_2]_\times \frac{I - \hat d_1 \hat d_1^\top}{\lVert d_1\rVert},
@@ -10,9 +10,17 @@ vectors
           \frac{\partial r}{\partial d_2} = [\hat d_1]_\times \frac{I - \hat d_2 \hat d_2^\top}{\lVert d_2\rVert} .
 
 :math:`\lVert r\rVert` is the sine of the angle. Three rows of rank two, smooth everywhere; zero for opposite
-directions too, so the orientation of a line or a plane does not matter. Lines parallel to a vanishing direction have a
-file of their own, :mod:`groma.factors.relations.line_direction`; a line parallel to a *plane* is a case of
-:mod:`groma.factors.relations.orthogonal`.
+directions too, so the orientation of a line or a plane does not matter. *Perpendicular* is
+
+.. math:: r = \hat d_1 \cdot \hat d_2, \quad
+          \frac{\partial r}{\partial d_1} = \frac{(\hat d_2 - r \hat d_1)^\top}{\lVert d_1\rVert}, \quad
+          \frac{\partial r}{\partial d_2} = \frac{(\hat d_1 - r \hat d_2)^\top}{\lVert d_2\rVert} .
+
+One row, the cosine of the angle. It turns its sign with the orientation of either direction; losses are even, so the
+cost does not. A line is parallel to a *plane* where it is perpendicular to the normal.
+
+Many lines share one vanishing direction, which is a variable of its own: it gathers what all of them say, and stays in
+the reduced system while the lines are eliminated.
 """
 
 from __future__ import annotations
@@ -47,12 +55,7 @@ def put_direction_block(J, record, column, size, offset):
 
 
 @kernel
-def _linearize(d1, d2, r, J_first, J_second):
-    k1 = d1[0] * d1[0] + d1[1] * d1[1] + d1[2] * d1[2]
-    k2 = d2[0] * d2[0] + d2[1] * d2[1] + d2[2] * d2[2]
-    if not (k1 > 1e-200 and k2 > 1e-200):
-        return False
-    k1, k2 = 1.0 / math.sqrt(k1), 1.0 / math.sqrt(k2)
+def _parallel(d1, d2, k1, k2, r, J_first, J_second):
     a0, a1, a2 = d1[0] * k1, d1[1] * k1, d1[2] * k1
     b0, b1, b2 = d2[0] * k2, d2[1] * k2, d2[2] * k2
     r[0], r[1], r[2] = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
@@ -70,18 +73,35 @@ def _linearize(d1, d2, r, J_first, J_second):
         J_second[i, 0] = (J_second[i, 0] - r[i] * b0) * k2
         J_second[i, 1] = (J_second[i, 1] - r[i] * b1) * k2
         J_second[i, 2] = (J_second[i, 2] - r[i] * b2) * k2
-    return True
+
+
+@kernel
+def _perpendicular(d1, d2, k1, k2, r, J_first, J_second):
+    cosine = (d1[0] * d2[0] + d1[1] * d2[1] + d1[2] * d2[2]) * k1 * k2
+    r[0] = cosine
+    for j in range(3):
+        J_first[0, j] = (d2[j] * k2 - cosine * d1[j] * k1) * k1
+        J_second[0, j] = (d1[j] * k1 - cosine * d2[j] * k2) * k2
 
 
 @loop
 def _linearize_all(variables, indices, layout, begin, end, columns, record):
-    sizes, offsets = layout
-    r, J_first, J_second = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    """Write the records of either relation; how many rows they have says which."""
+    (sizes, offsets), rows = layout, record.shape[1]
+    r, J_first, J_second = np.empty(rows), np.empty((rows, 3)), np.empty((rows, 3))
     degenerate = 0
     for i in range(begin, end):
         first = variables[0][indices[0][i], offsets[0] : offsets[0] + 3]
         second = variables[1][indices[1][i], offsets[1] : offsets[1] + 3]
-        if not _linearize(first, second, r, J_first, J_second):
+        k1 = first[0] * first[0] + first[1] * first[1] + first[2] * first[2]
+        k2 = second[0] * second[0] + second[1] * second[1] + second[2] * second[2]
+        if k1 > 1e-200 and k2 > 1e-200:
+            k1, k2 = 1.0 / math.sqrt(k1), 1.0 / math.sqrt(k2)
+            if rows == 3:
+                _parallel(first, second, k1, k2, r, J_first, J_second)
+            else:
+                _perpendicular(first, second, k1, k2, r, J_first, J_second)
+        else:
             r[:], J_first[:], J_second[:] = 0.0, 0.0, 0.0
             degenerate += 1
         put_direction_block(J_first, record[i - begin], columns[0], sizes[0], offsets[0])
@@ -93,20 +113,17 @@ def _linearize_all(variables, indices, layout, begin, end, columns, record):
 # ------------------------------------------------------------------------------------------------------------- Public
 @dataclass(frozen=True, kw_only=True)
 class DirectionPair(Factor):
-    """Two variables that each have a direction; the base of the parallel and orthogonal factors.
-
-    Subclasses declare two slots of kind line, plane or direction.
-    """
+    """Two variables that each have a direction: two slots of kind line, plane or direction."""
 
     invariance: ClassVar[Invariance] = ANY_SIMILARITY
 
-    @property
-    def _sizes(self) -> tuple[int, int]:
-        return tuple(FACTOR_COLUMNS[slot.kind] for slot in self.slots)  # type: ignore[return-value]
-
-    @property
-    def _offsets(self) -> tuple[int, int]:
-        return tuple(DIRECTION_OFFSET[slot.kind] for slot in self.slots)  # type: ignore[return-value]
+    def linearize(  # noqa: D102
+        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
+    ) -> int:
+        (_, first), (_, second) = self.references()
+        kinds = [slot.kind for slot in self.slots]
+        sizes, offsets = (tuple(table[kind] for kind in kinds) for table in (FACTOR_COLUMNS, DIRECTION_OFFSET))
+        return _linearize_all(inputs, (first.index, second.index), (sizes, offsets), begin, end, columns, record)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102
@@ -116,26 +133,39 @@ class DirectionPair(Factor):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ParallelDirectionPair(DirectionPair):
-    """Base of the factors whose two directions are parallel; residual is the cross product of unit vectors."""
-
-    rows: ClassVar[int] = 3
-    independent_rows: ClassVar[int] = 2
-
-    def linearize(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
-        (_, first), (_, second) = self.references()
-        layout = self._sizes, self._offsets
-        return _linearize_all(inputs, (first.index, second.index), layout, begin, end, columns, record)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Parallel(ParallelDirectionPair):
+class _Parallel(DirectionPair):
     #: The one variable.
     first: Ref
     #: The other variable.
     second: Ref
+
+    rows: ClassVar[int] = 3
+    independent_rows: ClassVar[int] = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Orthogonal(DirectionPair):
+    #: The one variable.
+    first: Ref
+    #: The other variable.
+    second: Ref
+
+    rows: ClassVar[int] = 1
+
+
+@register("line_direction")
+@dataclass(frozen=True, kw_only=True)
+class LineDirection(DirectionPair):
+    """Lines parallel to vanishing directions, either way round. Degenerate for a line at infinity."""
+
+    #: The lines, any scale of (m, d).
+    line: Ref
+    #: The vanishing directions.
+    direction: Ref
+
+    rows: ClassVar[int] = 3
+    independent_rows: ClassVar[int] = 2
+    slots: ClassVar[tuple[Slot, ...]] = (Slot("line", "line"), Slot("direction", "direction"))
 
 
 @register("parallel_lines")
@@ -174,5 +204,53 @@ class PlanePerpendicularToDirection(_Parallel):
 @dataclass(frozen=True, kw_only=True)
 class ParallelDirections(_Parallel):
     """Pairs of equal vanishing directions, up to orientation."""
+
+    slots: ClassVar[tuple[Slot, ...]] = (Slot("first", "direction"), Slot("second", "direction"))
+
+
+@register("orthogonal_lines")
+@dataclass(frozen=True, kw_only=True)
+class OrthogonalLines(_Orthogonal):
+    """Pairs of perpendicular lines, which need not meet. Degenerate for a line at infinity."""
+
+    slots: ClassVar[tuple[Slot, ...]] = (Slot("first", "line"), Slot("second", "line"))
+
+
+@register("orthogonal_planes")
+@dataclass(frozen=True, kw_only=True)
+class OrthogonalPlanes(_Orthogonal):
+    """Pairs of perpendicular planes. Degenerate for the plane at infinity."""
+
+    slots: ClassVar[tuple[Slot, ...]] = (Slot("first", "plane"), Slot("second", "plane"))
+
+
+@register("line_parallel_to_plane")
+@dataclass(frozen=True, kw_only=True)
+class LineParallelToPlane(_Orthogonal):
+    """Lines parallel to planes: direction perpendicular to normal."""
+
+    slots: ClassVar[tuple[Slot, ...]] = (Slot("first", "line"), Slot("second", "plane"))
+
+
+@register("line_perpendicular_to_direction")
+@dataclass(frozen=True, kw_only=True)
+class LinePerpendicularToDirection(_Orthogonal):
+    """Lines perpendicular to vanishing directions, level edges and the vertical for example."""
+
+    slots: ClassVar[tuple[Slot, ...]] = (Slot("first", "line"), Slot("second", "direction"))
+
+
+@register("plane_parallel_to_direction")
+@dataclass(frozen=True, kw_only=True)
+class PlaneParallelToDirection(_Orthogonal):
+    """Planes that contain a vanishing direction, walls and the vertical for example."""
+
+    slots: ClassVar[tuple[Slot, ...]] = (Slot("first", "plane"), Slot("second", "direction"))
+
+
+@register("orthogonal_directions")
+@dataclass(frozen=True, kw_only=True)
+class OrthogonalDirections(_Orthogonal):
+    """Pairs of perpendicular vanishing directions, the axes of a building for example."""
 
     slots: ClassVar[tuple[Slot, ...]] = (Slot("first", "direction"), Slot("second", "direction"))

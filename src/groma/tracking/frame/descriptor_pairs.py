@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Pair described features with others that lie near an expected place, by the bits in which descriptors differ.
+"""Pair described features by the bits in which their descriptors differ: anywhere, or near an expected place.
 
-In come places and binary descriptors of both; out come the pairs that are most alike for both partners, the nearest in
-the image among equals, and the most alike first.
+In come binary descriptors of both, and places; out come pairs that are most alike.
 """
 
 from __future__ import annotations
@@ -51,7 +50,58 @@ def _best_near(expected, first, pixel, second, radius, max_bits, partner, bits, 
                     partner[one], bits[one], distance[one] = other, differ, apart
 
 
+@loop
+def _best_anywhere(words, second, max_bits, partner, bits):
+    """Write for each of first (its ``words`` in columns) the nearest of second, or -1 if that has a nearer one.
+
+    All bits of a row are counted before any are compared: so the compiler counts those of several at once.
+    """
+    count = words.shape[1]
+    one, two, three, four = words[0], words[1], words[2], words[3]
+    differ, nearest = np.empty(count, np.int64), np.full(len(second), -1)
+    for i in range(second.shape[0]):
+        a, b, c, d = second[i, 0], second[i, 1], second[i, 2], second[i, 3]
+        least = np.int64(max_bits + 1)
+        for j in range(count):
+            differ[j] = (
+                _count_bits(one[j] ^ a) + _count_bits(two[j] ^ b) + _count_bits(three[j] ^ c) + _count_bits(four[j] ^ d)
+            )
+            least = min(least, differ[j])
+        if least > max_bits:
+            continue
+        for j in range(count):
+            if differ[j] < bits[j]:
+                partner[j], bits[j] = i, differ[j]
+            if nearest[i] < 0 and differ[j] == least:
+                nearest[i] = j
+    for j in range(count):
+        if partner[j] >= 0 and nearest[partner[j]] != j:
+            partner[j] = -1
+
+
 # ------------------------------------------------------------------------------------------------------------- Public
+
+
+def pair_anywhere(first: np.ndarray, second: np.ndarray, max_bits: int) -> tuple[IntArray, IntArray]:
+    """Pair descriptors that are nearest to each other, both ways; the first of those that are as near.
+
+    Parameters
+    ----------
+    first, second : (n, 32), (m, 32) uint8
+        Descriptors.
+    max_bits : int
+        Most bits in which two descriptors differ.
+
+    Returns
+    -------
+    (k,), (k,) int
+        Rows of both, in the order of the first.
+    """
+    partner, bits = np.full(len(first), -1), np.full(len(first), int(max_bits) + 1)
+    words = [np.ascontiguousarray(table).view(np.uint64) for table in (first, second)]
+    _best_anywhere(np.ascontiguousarray(words[0].T), words[1], int(max_bits), partner, bits)
+    rows = np.flatnonzero(partner >= 0)
+    return rows, partner[rows]
 
 
 def pair_near(
@@ -62,7 +112,7 @@ def pair_near(
     radius: float,
     max_bits: int,
 ) -> IntArray:
-    """Pair features with others near where they are expected.
+    """Pair features with others near where they are expected: the most alike for both, the nearest among equals.
 
     Parameters
     ----------
