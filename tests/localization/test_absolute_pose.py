@@ -356,4 +356,4 @@ def test_the_noise_of_a_fit_to_few_matches_is_not_told_too_small():
         noise = rng.normal(size=10)
         found.append(_pull((noise - basis @ (basis.T @ noise)).reshape(5, 2), 6, REFINEMENT)[1] ** 2)
     square, stiffness = _of_normal_noise(last_scale(5))
-    assert np.mean(found) == pytest.approx(square / stiffness**2, rel=0.06)
+    assert np.mean(found) == pytest.approx(square / stiffness**2, rel=0.02)

@@ -24,6 +24,7 @@ from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.refinement import fitted
 from groma.localization.pose.verdict import Evidence, Verdict, doubted_if_mirrored
 from groma.localization.retrieval import VladRetrieval
+from groma.localization.run import localize_images, query_files
 
 #: Images around one corner of the cabinet; every third is a query.
 FRAMES = [f"{number:04d}.jpg" for number in range(24, 45)]
@@ -224,7 +225,7 @@ def test_maps_and_images_that_do_not_fit_are_refused(place, tmp_path):
         Localizer(place / "map.npz", place / "images").localize(place / "queries" / QUERIES[0], camera)
 
 
-def test_command(place, tmp_path, capsys):
+def test_command(place, localizer, tmp_path, capsys):
     queries = tmp_path / "queries"
     shutil.copytree(place / "queries", queries)
     (queries / "bad.jpg").write_text("no image")
@@ -245,13 +246,15 @@ def test_command(place, tmp_path, capsys):
     right = [name for name, entry in told.items() if entry["status"] == "localized"]
     rows = [line.split() for line in (out / "poses.txt").read_text().splitlines()]
     assert [row[0] for row in rows] == right
+    alone = localize_images(localizer, query_files([place / "queries"]), tmp_path / "alone")  # without workers
+    assert [one.to_dict()["qvec"] for one in alone] == [told[name]["qvec"] for name in QUERIES]
     for name, *numbers in rows:
         assert [float(number) for number in numbers] == told[name]["qvec"] + told[name]["tvec"]
     model = read_scene(out)
     assert set(right) <= set(model.images.names)
     image = list(model.images.names).index(right[0])
     assert model.cam_centers_in_world[image] == pytest.approx(told[right[0]]["center"], abs=1e-6)
-    assert "Queries" in (out / "report.html").read_text()
+    assert f'<td class="words">{told["black.png"]["sentence"]}' in (out / "report.html").read_text()
     assert not out.with_name("out.work").exists()
 
 

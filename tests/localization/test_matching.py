@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Points, landmarks and lines that match: against the same searches written without any shortcut."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from worlds import CAMERA, make_world, project
@@ -120,6 +122,8 @@ def test_landmarks_are_matched_once_and_by_their_kind():
     found = described.match(points, seen_in(index, np.array([0, 1, 2])))
     assert set(map(tuple, found.tolist())) == {(0, 5), (1, 150), (2, 250), (3, 350), (4, 351)}
     np.testing.assert_array_equal(seen_in(index, np.array([1])), np.arange(100, 300))
+    few = replace(GATES, landmarks=150)  # points 100 to 199 by two of the images, then those of the first image
+    np.testing.assert_array_equal(seen_in(index, np.array([1, 0]), few), np.arange(100, 250))
     np.testing.assert_array_equal(counted_in(index, np.array([2, 0, 1]), shown), [2, 3, 2])
 
 

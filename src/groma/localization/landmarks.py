@@ -26,6 +26,7 @@ class LandmarkGates:
 
     points: int = gate(600, "points", "of a query, the coarsest", "cost: of matching")
     corners: int = gate(200, "points", "of its corners, the strongest", "cost: of matching")
+    landmarks: int = gate(10_000, "points", "of the map at most, those that two images see first", "cost: of matching")
     dimensions: int = gate(48, "directions", "of descriptors", "derived from their energy: 97 to 98 %")
     sample: int = gate(20_000, "descriptors", "that the directions are computed from", "cost: 10 ms")
 
@@ -86,12 +87,19 @@ def coarsest(points: DescribedPoints, gates: LandmarkGates = GATES) -> IntArray:
     return np.concatenate([blobs[order[: gates.points]], corners[: gates.corners]])
 
 
-def seen_in(index: MapIndex, images: IntArray) -> IntArray:
-    """Return the points of a map that some of its images see."""
-    seen = np.zeros(len(index.xyz), bool)
-    for image in images.tolist():
+def seen_in(index: MapIndex, images: IntArray, gates: LandmarkGates = GATES) -> IntArray:
+    """Return the points of a map that some images see, at most so many.
+
+    What two of them see is seen again more often, and more often from near the images that come first.
+    """
+    times, first = np.zeros((2, len(index.xyz)), np.int64)
+    for rank, image in enumerate(images.tolist()):
+        seen = np.zeros(len(index.xyz), bool)
         seen[index.point[index.begin[image] : index.begin[image + 1]]] = True
-    return np.flatnonzero(seen)
+        first[seen & (times == 0)] = rank
+        times += seen
+    point = np.flatnonzero(times)
+    return np.sort(point[np.lexsort((first[point], times[point] < 2))[: gates.landmarks]])
 
 
 def counted_in(index: MapIndex, images: IntArray, points: IntArray) -> IntArray:

@@ -99,12 +99,14 @@ def _table(queries: Sequence[PlacedImage]) -> str:
     """The queries as a card of the page."""
     rows = "".join(
         f"<tr><td>{html.escape(one.name)}</td><td>{one.status}</td><td>{len(one.point):,}</td><td>{len(one.line):,}</td>"
-        f"<td>{html.escape(one.sentence)}</td></tr>"
+        f'<td class="words">{html.escape(one.sentence)}</td></tr>'
         for one in queries
     )
     count = sum(one.status == "localized" for one in queries)
     return (
-        f'<section class="card"><h2>Queries</h2><p class="caption">{count} of {counted(len(queries), "photographs")} '
-        "localised. The images show what of the map was found in each.</p><table><thead><tr><th>photograph</th>"
-        f"<th>status</th><th>points</th><th>lines</th><th></th></tr></thead><tbody>{rows}</tbody></table></section>"
+        '<section class="card wide"><h2>Queries</h2><p class="caption">'
+        f"{count} of {counted(len(queries), 'photographs')} localised. "
+        "The images show what of the map was found in each.</p>"
+        "<table><thead><tr><th>photograph</th><th>status</th><th>points</th><th>lines</th><th></th></tr></thead>"
+        f"<tbody>{rows}</tbody></table></section>"
     )

@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Many photographs in one map: one after the other, each kept when it is finished, none stopping the others."""
+"""Many photographs in one map: shared by the workers, each kept when it is finished, none stopping the others."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 from groma._log import logged_stages, logger_of
 from groma.bounded.names import IMAGES
 from groma.errors import GromaError, InputError
+from groma.execution import map_work
 from groma.localization.calibration import CalibrationChoice, calibration_of
 from groma.localization.localizer import Localizer
 from groma.localization.map_index import digest_of
@@ -63,19 +65,24 @@ def localize_images(
     """
     say, choice = logged_stages("localization", progress), choice or CalibrationChoice()
     told = f"{digest_of(localizer.scene, localizer.files)} {localizer.options} {choice}"
-    found = []
     with lock_folder(work):
-        for done, (name, path) in enumerate(files.items()):
-            say("localising photographs", done, len(files))
-            file = work / f"{hashlib.sha256(name.encode()).hexdigest()[:16]}.npz"
-            digest = hashlib.sha256(f"{told} {_state_of(path)}".encode()).hexdigest()
-            one = read_placed(file, digest)
-            if one is None:
-                one = _localize(localizer, name, path, choice)
-                one.write(file, digest)
-            found.append(one)
-            logger_of("localization").info("%s: %s. %s", name, one.status, one.sentence)
-    return found
+        one = partial(_kept, localizer, choice, work, told)
+        return map_work(one, list(files.items()), partial(say, "localising photographs"))
+
+
+def _kept(
+    localizer: Localizer, choice: CalibrationChoice, work: Path, told: str, query: tuple[str, Path]
+) -> PlacedImage:
+    """Localise a photograph, unless that is done already, and keep the result."""
+    name, path = query
+    file = work / f"{hashlib.sha256(name.encode()).hexdigest()[:16]}.npz"
+    digest = hashlib.sha256(f"{told} {_state_of(path)}".encode()).hexdigest()
+    one = read_placed(file, digest)
+    if one is None:
+        one = _localize(localizer, name, path, choice)
+        one.write(file, digest)
+    logger_of("localization").info("%s: %s. %s", name, one.status, one.sentence)
+    return one
 
 
 def _localize(localizer: Localizer, name: str, path: Path, choice: CalibrationChoice) -> PlacedImage:

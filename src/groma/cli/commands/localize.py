@@ -81,6 +81,7 @@ def localize(
     from groma.cli.shared.extending import DESCRIBING, LOCALIZING
     from groma.cli.shared.interrupt import PROCESS, interruptible
     from groma.cli.shared.mapping import WRITING
+    from groma.execution import work_with
     from groma.localization.calibration import CalibrationChoice
     from groma.localization.localizer import LocalizeOptions, Localizer
     from groma.localization.pose.absolute_pose import PoseOptions
@@ -94,7 +95,7 @@ def localize(
     console.expect_stages(*DESCRIBING, LOCALIZING, WRITING)
     work = output.with_name(output.name + ".work")
     try:
-        with interruptible() as interruption, console.stages() as stages:
+        with interruptible() as interruption, console.stages() as stages, work_with(console.threads):
             say = interruption.checking(stages)
             localizer = Localizer(map_, images, options=options, progress=say)
             found = localize_images(localizer, files, work, choice, say)

@@ -101,10 +101,11 @@ def check_extension(extend: Path | None, map_images: Path | None, others: dict[s
 
 def _with_progress(console: Console, made: Callable[[Callable[[str, int, int], None]], _Made], kept: str) -> _Made:
     from groma.cli.shared.interrupt import interruptible
+    from groma.execution import work_with
 
     console.expect_compilation("map")
     try:
-        with interruptible() as interruption, console.stages() as stages:
+        with interruptible() as interruption, console.stages() as stages, work_with(console.threads):
             return made(interruption.checking(stages))
     except KeyboardInterrupt:
         raise typer.Exit(PROCESS.tell(f"{kept}: the same command goes on from there.")) from None

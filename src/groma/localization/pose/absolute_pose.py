@@ -246,7 +246,9 @@ def _unless_mirrored(
     Some of its points are matched first: mostly far too few of them agree with any pose.
     """
     agree = len(np.unique(cells_of(matches.points2d, best.camera, VERDICT.cells)[best.point_inliers]))
-    if _best_of_others(best.camera, mirror(_SOME), options, votes_of_a_part(agree + 1, 1.0 / _SOME)) is None:
+    some, votes = mirror(_SOME), votes_of_a_part(agree + 1, 1.0 / _SOME)
+    other = _best_of_others(best.camera, some, options, votes)
+    if other is None or evidence_of(other, some).agree < votes:
         return verdict
     points = matches.take(np.ones(matches.num_points, bool), np.zeros(matches.num_lines, bool))
     own = evidence_of(fitted(best.camera, points, best.pose, _errors(points, options)), points)
@@ -265,7 +267,7 @@ def _best_of_others(camera: QueryCamera, matches: Matches, options: PoseOptions,
     if possible < max(votes, 1):
         return None
     only_this = replace(options, refine_lens=False, focal_factors=(1.0,))
-    return _best(camera, matches, only_this, votes / possible, votes // 2)
+    return _best(camera, matches, only_this, votes / possible, votes)
 
 
 def _best(

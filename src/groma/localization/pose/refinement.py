@@ -61,6 +61,8 @@ _POSE = SolverOptions(
 #: Information of scaled unknowns below which they are not determined.
 _SINGULAR = 1e-10
 _LENS = SolverOptions(max_iterations=30, function_tolerance=1e-6, threads=1)
+#: Before the last fit a pose is only to collect what is near (cost: of steps).
+_ROUGHLY = 1e-3
 
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
@@ -156,8 +158,9 @@ def _pull(residual: FloatArray, unknowns: int, gates: RefinementGates) -> tuple[
     estimate by it.
 
     With the weight w(s) of a squared norm s, and pulls :math:`\psi = w r`, an M-estimate has the covariance of least
-    squares with the variance :math:`E[\psi^2] / E[\psi']^2`; pulls are divided by :math:`E[\psi']`, too. Both means are
-    those of the residuals and, counted as some more observations, those of normal noise as stated.
+    squares with the variance :math:`E[\psi^2] / E[\psi']^2`; pulls are divided by :math:`E[\psi']`, too. To the
+    variance that residuals show comes, counted as some more observations, that of normal noise as stated. It is not
+    the ratio of averages: with few matches that would be too small.
     """
     scale = last_scale(len(residual), gates)
     c, free = scale**2, max(residual.size - unknowns, 0)
@@ -167,12 +170,13 @@ def _pull(residual: FloatArray, unknowns: int, gates: RefinementGates) -> tuple[
     square = (noise**2).sum(axis=1, keepdims=True)
     of_noise = (1.0 + square / c) ** -2
     stiffness = of_noise - 4.0 * noise**2 / c * (1.0 + square / c) ** -3
+    mean = max(float(stiffness.mean()), float(of_noise.mean()) ** 2)  # of far outliers the former may vanish
+    shown = float(((of_noise * noise) ** 2).mean()) / mean**2
     square_of_normal, stiffness_of_normal = _of_normal_noise(scale)
     stated = 2.0 * gates.stated_weight
-    mean = (free * float(stiffness.mean()) + stated * stiffness_of_normal) / (free + stated)
-    mean = max(mean, float(of_noise.mean()) ** 2)  # of far outliers it may vanish
-    variance = (free * float(((of_noise * noise) ** 2).mean()) + stated * square_of_normal) / (free + stated)
-    return weight * residual / mean, float(np.sqrt(variance)) / mean
+    variance = (free * shown + stated * square_of_normal / stiffness_of_normal**2) / (free + stated)
+    mean = (free * mean + stated * stiffness_of_normal) / (free + stated)
+    return weight * residual / mean, float(np.sqrt(variance))
 
 
 @lru_cache(maxsize=256)
@@ -233,7 +237,8 @@ def refine(
         before, near = near, (wide | (squares[0] <= limits[0]), wide | (squares[1] <= limits[1]))
         last = round_ == gates.rounds or (before is not None and all(map(np.array_equal, near, before)))
         loss = GemanMcClure(last_scale(_agreeing(squares, gates), gates)) if last else Cauchy(gates.wide_loss)
-        solved = solve(with_loss(without_far(weighted, near), loss), options).problem
+        steps = options if last or refine_lens else replace(options, function_tolerance=_ROUGHLY)
+        solved = solve(with_loss(without_far(weighted, near), loss), steps).problem
         estimated = _camera_of(solved, camera) if refine_lens else camera
         if estimated is None:
             break
