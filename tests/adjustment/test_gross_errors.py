@@ -147,7 +147,7 @@ def test_the_frame_is_not_given_up(truth):
 
 
 def test_weak_positions_hold_the_frame_all_the_same(truth):
-    """Positions of kilometres beside pixels: their part of the equations is lost in rounding, not what they determine."""
+    """Positions of kilometres beside pixels: their part of the equations is lost in rounding, not the frame."""
     table = positions(truth, np.random.default_rng(0))
     weak = truth.replace(camera_positions=table.replace(covariance=1e12 * table.covariance))
     said = diagnose_scene(weak)
