@@ -4,7 +4,7 @@
 import importlib
 import pkgutil
 
-from _supported_names import public_names
+from _supported_names import public_names, supported
 from docutils import nodes
 from docutils.statemachine import StringList
 from sphinx.application import Sphinx
@@ -28,8 +28,9 @@ class PackageReference(SphinxDirective):
 
     def _section(self, name: str) -> nodes.Node:
         module = importlib.import_module(name)
-        # Constants of a module are its own affair unless it names them.
-        members = "" if hasattr(module, "__path__") else ", ".join(public_names(module))
+        # Constants of a module are its own affair unless it names them, or they are supported.
+        names = [] if hasattr(module, "__path__") else [*public_names(module), *supported().get(name, ())]
+        members = ", ".join(dict.fromkeys(names))
         section = nodes.section(ids=[f"module-{name.replace('.', '-')}-section"])
         section += nodes.title(text=name)
         lines = [f".. automodule:: {name}", f"   :members: {members}" if members else "   :no-members:", ""]

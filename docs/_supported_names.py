@@ -3,6 +3,7 @@
 
 import importlib
 import inspect
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
@@ -156,6 +157,7 @@ def public_names(module: ModuleType) -> tuple[str, ...]:
     )
 
 
+@cache
 def supported() -> dict[str, tuple[str, ...]]:
     """Return the supported names of each module."""
     found = {}

@@ -48,7 +48,7 @@ nb_merge_streams = True
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
-autodoc_default_options = {"members": True, "show-inheritance": True}
+autodoc_default_options = {"show-inheritance": True}
 autodoc_preserve_defaults = True
 # Signatures say FloatArray and not what that is made of.
 autodoc_type_aliases = {name: name for name in ("BoolArray", "FloatArray", "IntArray")}

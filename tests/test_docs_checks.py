@@ -9,6 +9,7 @@ import re
 import runpy
 import shlex
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -30,14 +31,18 @@ COMMANDS = [
 ]
 
 
-def options_of(words: list[str]) -> tuple[str, set[str]]:
-    """Return the command that words begin with, and its options."""
+@cache
+def whole_command():
     import typer.main
 
     from groma.cli.app import app
 
-    command = typer.main.get_command(app)
-    name = "groma"
+    return typer.main.get_command(app)
+
+
+def options_of(words: list[str]) -> tuple[str, set[str]]:
+    """Return the command that words begin with, and its options."""
+    command, name = whole_command(), "groma"
     for word in words:
         if not hasattr(command, "commands") or word.startswith("-"):
             break
@@ -51,7 +56,9 @@ def test_array_types_have_short_names_in_the_reference(monkeypatch):
     pytest.importorskip("myst_parser")
     monkeypatch.setenv("NUMBA_CACHE_DIR", "")  # the settings change both, for themselves
     monkeypatch.setattr(sys, "path", list(sys.path))
-    short = runpy.run_path(str(DOCS / "conf.py"))["_short"]
+    settings = runpy.run_path(str(DOCS / "conf.py"))
+    assert "members" not in settings["autodoc_default_options"]  # it would overrule what a page says of a module
+    short = settings["_short"]
     pixels = "ndarray[tuple[Any, ...], dtype[uint8]]"
     deferred = "~numpy.ndarray[tuple[~typing.Any, ...], ~numpy.dtype[~numpy.float64]]"
     assert short(f"(image: {pixels} | None) -> {deferred}") == "(image: NDArray[uint8] | None) -> FloatArray"

@@ -137,7 +137,7 @@ def test_a_full_disk_ends_the_command_in_one_line_and_loses_nothing(tmp_path, co
         patch.setattr(shutil, "disk_usage", lambda folder: usage._replace(free=9 << 20))
         assert run(command) == 1
     error = capsys.readouterr().err
-    assert error.count("\n") == 1 and "9 MiB left; the points of the images need 12 MiB. Make room" in error
+    assert error.count("\n") == 1 and "9 MiB left; the points of the images need 16 MiB. Make room" in error
 
     def full(*_, **__):
         raise OSError(28, "No space left on device", "a draft")
