@@ -3,9 +3,10 @@
 
 import numpy as np
 import pytest
-from _survey import control, made, positions, with_everything, with_objects
+from _survey import ELSEWHERE, control, control_file, made, positions, with_everything, with_objects
 
 from groma.adjustment.adjust import AdjustOptions, adjust
+from groma.adjustment.survey.attach import Survey, with_survey
 from groma.adjustment.survey.gross_errors import without_gross_errors
 from groma.adjustment.survey.reliability import reliability
 from groma.adjustment.terms.open_motions import num_open_motions
@@ -93,6 +94,42 @@ def test_nobody_knows_which_of_two_scale_bars_is_wrong(truth):
     scene = truth.replace(control_points=points.replace(role=np.zeros(6, int)), marks=marks, distances=bars)
     result, found = cleaned(scene)
     assert rejected_rows(result.scene) == set() and len(found.suspects) == 2
+
+
+def marks_of_a_check_point(truth, count):
+    """The scene with control points, one check point of which has so many marks; their rows, and true places."""
+    points, marks, xyz = control(truth, np.random.default_rng(1))
+    check = int(np.flatnonzero(points.is_check)[0])
+    seen = np.flatnonzero(marks.point_idx == check)
+    marks = marks.take(np.flatnonzero((marks.point_idx != check) | np.isin(np.arange(len(marks)), seen[:count])))
+    return truth.replace(control_points=points, marks=marks), np.flatnonzero(marks.point_idx == check), xyz
+
+
+@pytest.mark.parametrize(
+    ("count", "wrong"), [(2, [[150.0, 250.0]]), (3, [[150.0, 250.0]]), (3, [[25.0, -26.0], [128.0, 21.0]])]
+)
+def test_a_check_point_keeps_two_marks(truth, count, wrong):
+    """Of three marks a wrong one goes alone, though others look wrong beside it; of two nobody knows which it is."""
+    scene, rows, xyz = marks_of_a_check_point(truth, count)
+    for row, by in zip(rows, wrong, strict=False):
+        scene = off(scene, "marks", row, "pixel", by)
+    result, found = cleaned(scene)
+    assert len(rejected_rows(result.scene)) <= count - 2 and {one.kind for one in found.suspects} == {"mark"}
+    if (count, len(wrong)) == (3, 1):
+        assert rejected_rows(result.scene) == {("marks", rows[0])}
+        assert np.abs(result.scene.control_points.xyz - xyz).max() < 0.1
+
+
+def test_a_stray_mark_takes_no_part_until_it_is_tested(truth):
+    """The rays of two others meet: it waits outside, and is named and rejected in the end, unless suspects are kept."""
+    given, _ = control_file(truth, np.random.default_rng(1))
+    given.pixels[4] = [10.0, 10.0]
+    survey = Survey(control=given, control_sigma=(0.02,), mark_sigma_px=0.5)
+    start = truth.transformed(ELSEWHERE)
+    assert rejected_rows(with_survey(start, survey).scene) == {("marks", 4)}
+    found = adjust_surveyed(start, survey, OPTIONS)
+    assert rejected_rows(found.result.scene) == {("marks", 4)} and found.reliability.suspects[0].is_rejected
+    assert not rejected_rows(adjust_surveyed(start, survey, OPTIONS, keep_suspects=True).result.scene)
 
 
 def test_the_frame_is_not_given_up(truth):
