@@ -174,6 +174,7 @@ def _made(source, **names):
 def sample(tmp_path, monkeypatch):
     """The package: ``edit`` it, ``load`` it as a new process would, and read what was ``compiled`` since."""
     monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")  # Numba reads it again when anything in the environment changes
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     monkeypatch.syspath_prepend(str(tmp_path))
     folder = tmp_path / "sample"

@@ -7,7 +7,7 @@ import sys
 import numba
 import numpy as np
 import pytest
-from numba.core import compiler, ir, types
+from numba.core import types
 from numba.core.registry import cpu_target
 
 from groma._kernels import shortcuts
@@ -95,20 +95,3 @@ def test_operators_mean_what_they_mean_to_numba():
             meant = context.resolve_function_type(add, (one, other), {})
             for _ in range(2):
                 assert shortcuts._Typing(context).resolve_function_type(add, (one, other), {}) == meant
-
-
-def test_variables_of_statements_are_those_that_numba_lists():
-    def listed(value):
-        if isinstance(value, ir.Var):
-            return [value]
-        if isinstance(value, ir.Inst):
-            return listed(value._kws if isinstance(value, ir.Expr) else vars(value))
-        items = value.values() if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else ()
-        return [name for item in items for name in listed(item)]
-
-    for function in (_longest, _given_back, _until_negative):
-        blocks = compiler.run_frontend(function.py_func).blocks.values()
-        statements = [statement for block in blocks for statement in block.body]
-        assert len(statements) > 4
-        for statement in statements:
-            assert statement.list_vars() == listed(statement)

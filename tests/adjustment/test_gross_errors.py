@@ -6,6 +6,7 @@ import pytest
 from _survey import ELSEWHERE, control, control_file, made, positions, with_everything, with_objects
 
 from groma.adjustment.adjust import AdjustOptions, adjust
+from groma.adjustment.diagnosis import diagnose_scene
 from groma.adjustment.survey.attach import Survey, with_survey
 from groma.adjustment.survey.gross_errors import without_gross_errors
 from groma.adjustment.survey.reliability import reliability
@@ -143,6 +144,16 @@ def test_the_frame_is_not_given_up(truth):
     result, _ = cleaned(off(marked, "marks", 5, "pixel", [20.0, 0.0]))  # what is elsewhere goes all the same
     assert rejected_rows(result.scene) == {("marks", 5)}
     assert num_open_motions(scene) == 0 and num_open_motions(with_rejected(scene, {("camera_positions", 1)})) == 1
+
+
+def test_weak_positions_hold_the_frame_all_the_same(truth):
+    """Positions of kilometres beside pixels: their part of the equations is lost in rounding, not the frame."""
+    table = positions(truth, np.random.default_rng(0))
+    weak = truth.replace(camera_positions=table.replace(covariance=1e12 * table.covariance))
+    said = diagnose_scene(weak)
+    assert said.num_free_motions == 0 and "held by the measurements alone" in " ".join(map(str, said.findings))
+    assert diagnose_scene(weak.replace(camera_positions=table.take([0, 3]))).num_free_motions == 1
+    assert diagnose_scene(truth).num_free_motions == 7
 
 
 def test_standard_deviations_stated_too_small_reject_nothing(truth):

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Parts of finding a pose: features paired near expected places, depths read, poses proposed among wrong matches."""
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -9,7 +11,8 @@ from groma.features.depth.points import DEPTH_POINTS, depth_at
 from groma.geometry import se3
 from groma.tracking.frame.camera import TrackCamera, into
 from groma.tracking.frame.descriptor_pairs import pair_anywhere, pair_near
-from groma.tracking.pose.relocalise import pose_from_matches
+from groma.tracking.gates import DEFAULT
+from groma.tracking.pose.relocalise import _Search, pose_from_matches
 
 CAMERA = TrackCamera(525.0, 525.0, 320.0, 240.0, 640, 480)
 
@@ -109,3 +112,22 @@ def test_depths_are_medians_of_what_is_known_and_alike():
         expected = np.median(near) if good and np.median(near) <= 2.9 else np.nan
         np.testing.assert_equal(depth, expected)
     assert 50 < np.isfinite(found).sum() < 350
+
+
+def _search(agreeing, scores):
+    """A search in which poses, told by their x, agree with so many features, and score so much once refined."""
+    search = object.__new__(_Search)
+    search.gates, search._best, search._tried = DEFAULT.finding, None, []
+    search.track_map = SimpleNamespace(near=SimpleNamespace(depth=1.0))
+    search._agreeing = lambda pose: agreeing[pose[4]]
+    search._refine = lambda pose: SimpleNamespace(score=scores[pose[4]], estimate=SimpleNamespace(pose=pose))
+    return search
+
+
+@pytest.mark.parametrize(("others", "best"), [(371, 2.0), (353, 1.0)])
+def test_poses_that_about_as_much_agrees_with_are_both_refined(others, best):
+    """One bar of a radiator away 393 features agree, at the right pose 371: the better fit wins. 353 are fewer."""
+    wrong, right = (np.array([0, 0, 0, 1.0, x, 0, 0]) for x in (1.0, 2.0))
+    search = _search({1.0: 393.0, 2.0: float(others)}, {1.0: 366.0, 2.0: 375.0})
+    search.best_of([wrong], 1)
+    assert search.best_of([right], 4).estimate.pose[4] == best

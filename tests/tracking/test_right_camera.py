@@ -124,8 +124,11 @@ def test_a_pair_of_images_is_put_into_rows(turn):
 # ------------------------------------------------------------------------------------------------------------- maps
 
 
-def _map(seed, turn, assumed=NONE, noise=0.3, keyframes=7):
-    """A drive of 1 m a keyframe past points 4 to 40 m away; right pixels are turned back by assumed angles."""
+def _map(seed, turn, assumed=NONE, noise=0.3, keyframes=7, as_depths=False):
+    """A drive of 1 m a keyframe past points 4 to 40 m away; right pixels are turned back by assumed angles.
+
+    Every second one may be kept as the depth that it gives, as those of described features are.
+    """
     rng = np.random.default_rng(seed)
     places = np.column_stack([rng.uniform(-12, 12, 700), rng.uniform(-3, 3, 700), rng.uniform(6, 45, 700)])
     track_map, points = TrackMap(), None
@@ -140,8 +143,11 @@ def _map(seed, turn, assumed=NONE, noise=0.3, keyframes=7):
         pixel = pixel[rows] + noise * rng.normal(size=(len(rows), 2))
         right = CAMERA.project((at[rows] - [CAMERA.baseline, 0, 0]) @ _exp(turn).T)
         right = retargeted(CAMERA, right + noise * rng.normal(size=right.shape), NONE, assumed)
-        nothing = np.full(len(rows), np.nan)
-        table = PointMeasurements(rows, pixel, np.ones(len(rows)), nothing, nothing, right)
+        depth = CAMERA.fx * CAMERA.baseline / (pixel - right)[:, 0]
+        depth[(np.arange(len(rows)) % 2 == 0) | (not as_depths) | (depth < 0)] = np.nan
+        right[np.isfinite(depth)] = np.nan
+        sigma = 0.5 * depth**2 / (CAMERA.fx * CAMERA.baseline)
+        table = PointMeasurements(rows, pixel, np.ones(len(rows)), depth, sigma, right)
         measured = replace(Measurements.empty(), points=table)
         track_map.keyframes.append(
             Keyframe(k, float(k), f"{k}.png", pose, None, measured, Features.none(), np.zeros(0), 20.0)
@@ -149,12 +155,12 @@ def _map(seed, turn, assumed=NONE, noise=0.3, keyframes=7):
     return track_map, places
 
 
-@pytest.mark.parametrize("assumed", [NONE, TURN, -TURN])
-def test_a_map_tells_all_three_angles(assumed):
+@pytest.mark.parametrize(("assumed", "as_depths"), [(NONE, False), (TURN, False), (-TURN, False), (-TURN, True)])
+def test_a_map_tells_all_three_angles(assumed, as_depths):
     """Whatever they were turned back by: to a tenth of a pixel, and yaw within its standard deviation."""
     total = 0.0
     for seed in range(4):
-        track_map, _ = _map(seed, TURN, assumed)
+        track_map, _ = _map(seed, TURN, assumed, as_depths=as_depths)
         before = RightTurn(assumed, KNOWN)
         turn, job = estimate_turn(track_map, CAMERA, before, TrackOptions())
         assert job is not None

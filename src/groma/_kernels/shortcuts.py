@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What Numba's compiler asks again and again, answered sooner; the answers are Numba's.
 
-Numba looks for the meaning of ``a + b`` among some fifteen rules, in every function and several times in each, and
-walks through statements with a check for each kind of thing for the variables in them. Here the first is remembered by
-the types of the operands, and the second asks for kinds in the order of how often they occur. Each is a tenth of the
-time that Python takes of a compilation.
+Numba looks for the meaning of ``a + b`` among some fifteen rules, in every function and several times in each. Here it
+is remembered by the types of the operands: a tenth of the time that Python takes of a compilation.
 
 In come steps and classes of Numba's compiler; out comes ``TypeInference``, one of the steps.
 """
@@ -14,7 +12,7 @@ from __future__ import annotations
 import operator
 from typing import Any
 
-from numba.core import ir, types
+from numba.core import types
 from numba.core.compiler_machinery import register_pass
 from numba.core.typed_passes import NopythonTypeInference
 
@@ -66,32 +64,3 @@ class TypeInference(NopythonTypeInference):
             return super().run_pass(state)
         finally:
             state.typingctx = context
-
-
-def _variables(found: list[ir.Var], value: Any) -> None:
-    """Add the variables in a part of a statement."""
-    kind = type(value)
-    if kind is ir.Var:
-        found.append(value)
-    elif kind is ir.Expr:
-        for part in value._kws.values():
-            _variables(found, part)
-    elif kind in (list, tuple):
-        for part in value:
-            _variables(found, part)
-    elif kind is dict:
-        for part in value.values():
-            _variables(found, part)
-    elif kind is not ir.Loc and isinstance(value, ir.Inst):
-        found.extend(value.list_vars())
-
-
-def _variables_in(self: ir.Inst, val: Any) -> list[ir.Var]:
-    found: list[ir.Var] = []
-    _variables(found, val)
-    return found
-
-
-def take() -> None:
-    """Let Numba list variables like this."""
-    ir.Inst._rec_list_vars = _variables_in

@@ -95,6 +95,8 @@ def _by_columns(
     job = job_of(track_map, camera, living, held, False, gates.max_iterations, options, views)
     if job is None or np.isfinite(job.point_table.right[:, 0]).sum() < gates.min_columns:
         return known, None
+    # Depths that features had where the map was lost are columns under the yaw that was assumed: they would keep it.
+    job.scene = job.scene.replace(point_depths=job.scene.point_depths.take(np.zeros(0, np.int64)))
     job.function_tolerance = 1e-6
     job.solve()
     assert job.solved is not None

@@ -71,6 +71,10 @@ class FindingGates:
     near: float = gate(6.0, "px", "a feature agrees within this distance; coarse scales are not precise", SEQUENCES)
     search: float = gate(0.07, "share", "where features are looked for around a guess, of the image's width", SEQUENCES)
     max_refined: int = gate(4, "poses", "proposals that are refined", "cost: time to find a pose")
+    even: float = gate(
+        2.0, "sigma", "numbers that agree with two poses differ by less: both are refined",
+        "derived from counts: their variance is their mean",
+    )  # fmt: skip
     same_shift: float = gate(
         0.01, "share", "a proposal this near to an earlier one is left out, of the depth", "cost: time"
     )

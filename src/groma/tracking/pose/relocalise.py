@@ -162,7 +162,7 @@ def find_pose(
     if best is not None and best.score >= strong:
         # What repeats itself agrees with a wrong guess, too; what no guess suggests may agree with more.
         keyframes = keyframes[:1]
-    others = [search.proposal(keyframe, best) for keyframe in keyframes]
+    others = [search.proposal(keyframe) for keyframe in keyframes]
     return search.best_of([pose for pose in others if pose is not None], gates.finding.max_refined)
 
 
@@ -195,27 +195,17 @@ class _Search:
         agree = np.array([len(self.near(guess, 3 * self.gates.near)) for guess in guesses])
         return [guesses[k] for k in np.argsort(-agree, kind="stable")]
 
-    def proposal(self, keyframe: Keyframe, best: Found | None) -> FloatArray | None:
+    def proposal(self, keyframe: Keyframe) -> FloatArray | None:
         """Pose from features that match those of one keyframe, wherever they are.
 
-        Where a pose is there already, only what is left beside it is looked at, and only as long as more of that could
-        agree with another one.
+        Those that agree with a pose which is there already take part: on what repeats itself a wrong pose agrees with
+        the features of the right one.
         """
         first, second = keyframe.features, self.data.features
-        rows, columns = np.arange(len(first.pixel)), np.arange(len(second.pixel))
-        agreeing = 0
-        if best is not None:
-            mine = best.pairs[self.known.of[best.pairs[:, 0]] == self.known.keyframes.index(keyframe)]
-            agreeing = len(mine)
-            rows, columns = np.delete(rows, self.known.row[mine[:, 0]]), np.delete(columns, mine[:, 1])
-        if min(len(rows), len(columns)) <= agreeing:
-            return None
-        one, other = pair_anywhere(first.descriptor[rows], second.descriptor[columns], self.all_gates.features.max_bits)
-        places = feature_places(self.track_map, self.camera, keyframe, rows[one])
+        rows, columns = pair_anywhere(first.descriptor, second.descriptor, self.all_gates.features.max_bits)
+        places = feature_places(self.track_map, self.camera, keyframe, rows)
         known = np.isfinite(places[:, 0])
-        if known.sum() <= agreeing:
-            return None
-        return self._from_pairs(places[known], columns[other[known]])
+        return self._from_pairs(places[known], columns[known])
 
     def _from_pairs(self, places: FloatArray, second: IntArray) -> FloatArray | None:
         pixel = self.data.features.pixel[second]
@@ -223,11 +213,16 @@ class _Search:
         return found[0] if found is not None else None
 
     def best_of(self, starts: list[FloatArray], most: int) -> Found | None:
-        """Refine the starts that most agrees with, and more than with the best pose so far; return the best then."""
+        """Refine the starts that most agrees with, unless clearly more does with the best pose; return the best then.
+
+        Beside what repeats itself a wrong pose agrees with about as much as the right one, before both are refined.
+        """
         judged = [self._agreeing(start) for start in starts]
         for k in np.argsort(-np.array(judged), kind="stable")[:most]:
-            if self._best is not None and judged[k] <= self._agreeing(self._best.estimate.pose):
-                break
+            if self._best is not None:
+                agreeing = self._agreeing(self._best.estimate.pose)
+                if judged[k] < agreeing - self.gates.even * math.sqrt(agreeing):
+                    break
             if self._is_known(starts[k]):
                 continue
             found = self._refine(starts[k])
