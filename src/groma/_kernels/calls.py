@@ -17,16 +17,14 @@ from llvmlite import ir as llvm
 from numba.core import cgutils, types
 from numba.core.callwrapper import PyCallWrapper
 
-_FLOATS = (types.float32, types.float64)
+_NUMBERS = {*types.signed_domain, types.float32, types.float64}
 
 
 def is_readable(kind: Any) -> bool:
     """Whether arguments of a type are read here: arrays, signed and real numbers, nothing, and tuples of such."""
     if isinstance(kind, types.Tuple | types.UniTuple):
         return all(map(is_readable, kind.types))
-    if type(kind) is types.Integer:
-        return kind.signed
-    return type(kind) in (types.Array, types.Boolean, types.NoneType) or kind in _FLOATS
+    return type(kind) in (types.Array, types.Boolean, types.NoneType) or kind in _NUMBERS
 
 
 class CallWrapper(PyCallWrapper):
