@@ -9,8 +9,8 @@ that LSD has not. Columns: segments in an image; lines of all confidences, and t
 reference they find and how many are right, per cent; processor seconds of detection for an image.
 
 Where edges are known they are found and right at the thresholds of the scene. Of the cabinet, found are its twelve
-edges, right are lines on them. Photographs without a reference have the supported length of the lines, and the share
-that their probabilities expect to be right.
+edges, right are lines on them. For photographs without a reference, right is the share that the probabilities of the
+lines expect to be.
 """
 
 import argparse
@@ -38,7 +38,7 @@ from groma.mapping.checkpoints import Stages
 from groma.mapping.lines.confidence import DEFAULT_CONFIDENCE
 from groma.mapping.map import MapOptions, adjust_points, map_images, map_segments
 from groma.scene import Scene
-from groma.scene.line_intervals import one_line_per_interval, supported_lengths
+from groma.scene.line_intervals import one_line_per_interval
 
 ROOT = Path(__file__).parents[1]
 
@@ -84,7 +84,7 @@ def compared(source: LineScene, scene: Scene) -> dict:
         cabinet = score_cabinet(scene, evaluate_poses(scene, read_scene(folder() / "motion_capture")).alignment)
         found, right = [cabinet.num_edges / 12], [cabinet.num_lines / max(len(scene.lines), 1)]
     else:
-        found, right = [float(supported_lengths(scene).sum())], [float(scene.lines.confidence.mean())]
+        found, right = [], [float(scene.lines.confidence.mean())]
     return {"lines": len(lines), "found": found, "right": right}
 
 

@@ -21,9 +21,9 @@ walk round a corridor in place of the block: points, lines, planes, and what lie
 With ``--plain-sums`` one process adjusts in turn with sums of twice the digits, as always, and with plain ones.
 
 With ``--states`` a corridor of so many images with known poses is solved at once and in parts by so many ranks, without
-damping, until the cost falls no more; reported are the largest differences of states, metres and radians. The cost is
-known to its rounding, eps, and grows by half a square of the distance to the minimum in standard deviations. So no cost
-tells apart what lies within sqrt(2 eps cost) standard deviations of it, which is what lines are compared with.
+damping, until the gradient gets no smaller; reported are the largest differences of states, metres and radians. The
+cost is known to its rounding, eps, and grows by half a square of the distance to the minimum in standard deviations. So
+no cost tells apart what lies within sqrt(2 eps cost) standard deviations of it, which is what lines are compared with.
 """
 
 import argparse

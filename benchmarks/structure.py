@@ -337,7 +337,7 @@ def along_exact(truth: Truth, scene: Scene, fewest: int) -> Scene:
             share = np.exp(mixed - total).mean(axis=1, keepdims=True)
         if total.sum() > best[0]:
             best = total.sum(), np.exp(mixed - total)[:-1]
-    rows = np.flatnonzero(best[1].max(axis=0, initial=0.0) > options.min_line_probability)
+    rows = np.flatnonzero(best[1].max(axis=0, initial=0.0) > options.min_direction_probability)
     pairs = np.column_stack([lines[rows], best[1][:, rows].argmax(axis=0)]) if len(rows) else np.zeros((0, 2), int)
     return Scene(
         lines=scene.lines,

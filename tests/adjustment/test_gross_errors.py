@@ -3,9 +3,11 @@
 
 import numpy as np
 import pytest
-from _survey import control, made, positions, with_everything, with_objects
+from _survey import ELSEWHERE, control, control_file, made, positions, with_everything, with_objects
 
 from groma.adjustment.adjust import AdjustOptions, adjust
+from groma.adjustment.diagnosis import diagnose_scene
+from groma.adjustment.survey.attach import Survey, with_survey
 from groma.adjustment.survey.gross_errors import without_gross_errors
 from groma.adjustment.survey.reliability import reliability
 from groma.adjustment.terms.open_motions import num_open_motions
@@ -95,6 +97,42 @@ def test_nobody_knows_which_of_two_scale_bars_is_wrong(truth):
     assert rejected_rows(result.scene) == set() and len(found.suspects) == 2
 
 
+def marks_of_a_check_point(truth, count):
+    """The scene with control points, one check point of which has so many marks; their rows, and true places."""
+    points, marks, xyz = control(truth, np.random.default_rng(1))
+    check = int(np.flatnonzero(points.is_check)[0])
+    seen = np.flatnonzero(marks.point_idx == check)
+    marks = marks.take(np.flatnonzero((marks.point_idx != check) | np.isin(np.arange(len(marks)), seen[:count])))
+    return truth.replace(control_points=points, marks=marks), np.flatnonzero(marks.point_idx == check), xyz
+
+
+@pytest.mark.parametrize(
+    ("count", "wrong"), [(2, [[150.0, 250.0]]), (3, [[150.0, 250.0]]), (3, [[25.0, -26.0], [128.0, 21.0]])]
+)
+def test_a_check_point_keeps_two_marks(truth, count, wrong):
+    """Of three marks a wrong one goes alone, though others look wrong beside it; of two nobody knows which it is."""
+    scene, rows, xyz = marks_of_a_check_point(truth, count)
+    for row, by in zip(rows, wrong, strict=False):
+        scene = off(scene, "marks", row, "pixel", by)
+    result, found = cleaned(scene)
+    assert len(rejected_rows(result.scene)) <= count - 2 and {one.kind for one in found.suspects} == {"mark"}
+    if (count, len(wrong)) == (3, 1):
+        assert rejected_rows(result.scene) == {("marks", rows[0])}
+        assert np.abs(result.scene.control_points.xyz - xyz).max() < 0.1
+
+
+def test_a_stray_mark_takes_no_part_until_it_is_tested(truth):
+    """The rays of two others meet: it waits outside, and is named and rejected in the end, unless suspects are kept."""
+    given, _ = control_file(truth, np.random.default_rng(1))
+    given.pixels[4] = [10.0, 10.0]
+    survey = Survey(control=given, control_sigma=(0.02,), mark_sigma_px=0.5)
+    start = truth.transformed(ELSEWHERE)
+    assert rejected_rows(with_survey(start, survey).scene) == {("marks", 4)}
+    found = adjust_surveyed(start, survey, OPTIONS)
+    assert rejected_rows(found.result.scene) == {("marks", 4)} and found.reliability.suspects[0].is_rejected
+    assert not rejected_rows(adjust_surveyed(start, survey, OPTIONS, keep_suspects=True).result.scene)
+
+
 def test_the_frame_is_not_given_up(truth):
     """Of three positions one is wrong: without it the turn about the others would be open."""
     scene = truth.replace(camera_positions=positions(truth, np.random.default_rng(0)).take([0, 2, 5]))
@@ -106,6 +144,16 @@ def test_the_frame_is_not_given_up(truth):
     result, _ = cleaned(off(marked, "marks", 5, "pixel", [20.0, 0.0]))  # what is elsewhere goes all the same
     assert rejected_rows(result.scene) == {("marks", 5)}
     assert num_open_motions(scene) == 0 and num_open_motions(with_rejected(scene, {("camera_positions", 1)})) == 1
+
+
+def test_weak_positions_hold_the_frame_all_the_same(truth):
+    """Positions of kilometres beside pixels: their part of the equations is lost in rounding, not the frame."""
+    table = positions(truth, np.random.default_rng(0))
+    weak = truth.replace(camera_positions=table.replace(covariance=1e12 * table.covariance))
+    said = diagnose_scene(weak)
+    assert said.num_free_motions == 0 and "held by the measurements alone" in " ".join(map(str, said.findings))
+    assert diagnose_scene(weak.replace(camera_positions=table.take([0, 3]))).num_free_motions == 1
+    assert diagnose_scene(truth).num_free_motions == 7
 
 
 def test_standard_deviations_stated_too_small_reject_nothing(truth):

@@ -176,6 +176,8 @@ def test_bad_options():
         find_structure(Scene(), StructureOptions(level=2.0))
     with pytest.raises(InputError, match="min_line_probability"):
         find_structure(Scene(), StructureOptions(min_line_probability=1.0))
+    with pytest.raises(InputError, match="min_direction_probability"):
+        find_structure(Scene(), StructureOptions(min_direction_probability=-0.1))
 
 
 @pytest.mark.shared

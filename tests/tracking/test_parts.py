@@ -20,9 +20,10 @@ from groma.tracking.frame.measurements import LineMeasurements, Measurements, Pl
 from groma.tracking.frame.planes import frame_planes
 from groma.tracking.frame.sparse_depth import fill_sparse
 from groma.tracking.frame.stereo import dense_disparities, match_right
+from groma.tracking.gates import DEFAULT
 from groma.tracking.map.landmarks import ALIVE, DEAD, LineTable, PlaneTable, PointTable
 from groma.tracking.map.lines import assign, carried, line_ends
-from groma.tracking.map.planes import add_planes, assign_planes, merge_planes
+from groma.tracking.map.planes import add_planes, assign_planes, grow, merge_planes
 from groma.tracking.map.triangulation import triangulate
 from groma.tracking.pose.estimate import LOSSES, MapView, estimate_pose, rough_pose
 from groma.tracking.pose.prediction import MotionModel
@@ -198,6 +199,24 @@ def test_depth_of_pixels_and_segments():
     assert np.abs(inverse[0] - 1.0).max() < 1e-6
     assert (sigma[0] < 0.01).all()
     assert np.isnan(inverse[1]).all()
+
+
+def test_a_plane_keeps_one_sample_of_each_box():
+    rng, table, gates = np.random.default_rng(4), PlaneTable(), DEFAULT.planes
+    table.extend(1)
+    for count in (20, 300):
+        before = table.samples[0][np.isfinite(table.samples[0][:, 0])]
+        places = rng.uniform((-3.0, -0.5, -1e-3), (3.0, 0.5, 1e-3), (count, 3))
+        grow(table, 0, places, 1.0, gates)
+        both, size = np.concatenate([before, places]), gates.box
+        while len({tuple(cell) for cell in np.floor(both / size).tolist()}) > table.samples_kept:
+            size *= gates.box_growth
+        first = {}
+        for place in both.tolist():
+            first.setdefault(tuple(np.floor(np.array(place) / size).tolist()), place)
+        kept = table.samples[0][np.isfinite(table.samples[0][:, 0])]
+        np.testing.assert_array_equal(kept, [first[cell] for cell in sorted(first)])
+    assert size > gates.box
 
 
 def test_holes_between_samples_of_a_plane_are_filled():

@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.places import at_places_of
+from groma.adjustment.terms.open_motions import num_open_motions
 from groma.problem.problem import Problem
 from groma.scene import Scene
 from groma.scene.local_frame import local_frame
@@ -53,4 +56,16 @@ def diagnose_scene(
             return f"calibration {index} ({group.removeprefix('intrinsics/')})"
         return f"{group.removesuffix('s')} {index}"
 
-    return diagnose(problem, name, threads=threads)
+    found = diagnose(problem, name, threads=threads)
+    held = found.num_free_motions and scene.has_survey and num_open_motions(scene) == 0
+    return _held_by_measurements(found) if held else found
+
+
+def _held_by_measurements(found: Diagnosis) -> Diagnosis:
+    """Return what is said where measurements hold the frame, too weakly beside the images for rounding to leave it."""
+    sentences = {
+        "determined": "Everything is determined by the data.",
+        "free_motions": "The frame is held by the measurements alone, which weigh little beside the images.",
+    }
+    findings = tuple(replace(one, sentence=sentences.get(one.kind, one.sentence)) for one in found.findings)
+    return replace(found, free_motions=(), num_free_motions=0, findings=findings)

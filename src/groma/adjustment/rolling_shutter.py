@@ -22,9 +22,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from groma._counted import counted, natural_key
+from groma._trees import kd_tree
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult, Progress
@@ -196,7 +196,7 @@ def with_rolling_shutter(scene: Scene, along: str = "rows", gates: RollingShutte
             "out, or adjust the scene without them."
         )
     count, centers = scene.num_images, scene.cam_centers_in_world
-    nearest = KDTree(centers).query(centers, k=2)[0][:, 1]
+    nearest = kd_tree(centers).query(centers, k=2)[0][:, 1]
     apart = float(np.median(nearest[nearest > 0.0])) if (nearest > 0.0).any() else 1.0
     sigma = np.tile(np.repeat([gates.shift * apart, gates.turn], 3), (count, 1))
     nothing = np.zeros((count, 6))

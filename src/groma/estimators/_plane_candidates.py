@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from groma._numba import kernel, loop
+from groma._trees import kd_tree
 from groma._typing import FloatArray, IntArray
 from groma.estimators._plane_loops import BALL, height_kernel, least_axis_kernel, variance_kernel
 from groma.estimators._plane_options import PLANE_SEARCH
@@ -56,7 +56,7 @@ class Features:
 def features_of(places: FloatArray, noise: FloatArray, partner: IntArray, carrier: IntArray) -> Features:
     """Return places (N, 3) of points and segment ends with their covariances (N, 3, 3), and what is near what."""
     near = min(PLANE_SEARCH.neighbours, len(places))
-    tree = KDTree(places)
+    tree = kd_tree(places)
     distance, neighbours = tree.query(places, k=near, workers=num_threads())
     spacing = np.maximum(distance[:, min(PLANE_SEARCH.rank, near - 1)], 1e-12)
     order = np.asarray(tree.indices, dtype=np.int64)
@@ -155,7 +155,7 @@ def from_segments(features: Features, num_points: int, gate: float) -> tuple[Flo
         return np.zeros((0, 4)), np.zeros(0, np.int64), 0
     middle = ends.mean(axis=1)
     count = min(PLANE_SEARCH.near_segments + 1, len(ends))
-    near = np.asarray(KDTree(middle).query(middle, k=count, workers=num_threads())[1], dtype=np.int64)
+    near = np.asarray(kd_tree(middle).query(middle, k=count, workers=num_threads())[1], dtype=np.int64)
     first, second = np.repeat(np.arange(len(ends)), count - 1), near[:, 1:].ravel()
     once = np.unique(np.column_stack([np.minimum(first, second), np.maximum(first, second)]), axis=0)
     once = once[once[:, 0] != once[:, 1]]

@@ -6,8 +6,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
 
+from groma._trees import kd_tree
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators._plane_candidates import Features
 from groma.estimators._plane_loops import (
@@ -162,7 +162,7 @@ class Grower:
         )  # fmt: skip
         if missing:  # the others among their neighbours do not lie on the plane
             places, short = features.places[rows], short[:missing]
-            tree = KDTree(places, balanced_tree=False, compact_nodes=False)
+            tree = kd_tree(places, balanced_tree=False, compact_nodes=False)
             distance[short], nearest[short] = tree.query(places[short], k=count)
         out, count_of = np.empty(len(rows), np.int64), np.empty(2, np.int64)
         self._held[held] = 1
@@ -209,7 +209,7 @@ def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, pl
     if len(tested) == 0:
         return np.zeros(0, dtype=bool)
     basis = np.stack(perpendicular(plane[:3]), axis=1)
-    tree = KDTree(places @ basis, balanced_tree=False, compact_nodes=False)
+    tree = kd_tree(places @ basis, balanced_tree=False, compact_nodes=False)
     distance, _ = tree.query(tested @ basis, distance_upper_bound=np.nextafter(GATES.link * spacing.max(), np.inf))
     return np.asarray(distance <= GATES.link * spacing)
 

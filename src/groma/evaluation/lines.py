@@ -36,8 +36,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import KDTree
 
+from groma._trees import kd_tree
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
 from groma.evaluation.gates import SCORES
@@ -240,7 +240,7 @@ class Distances:
         first = len(segments) + len(triangles)
         self.owner = np.concatenate([owner_line, owner_face + len(segments), first + np.arange(len(points))])
         self.reach = max(reach_line, reach_face)
-        self.tree = KDTree(anchors)
+        self.tree = kd_tree(anchors)
 
     def of(self, places: FloatArray) -> FloatArray:
         """Return the distance of each place, (n, 3)."""

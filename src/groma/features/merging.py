@@ -11,10 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 
+from groma._trees import kd_tree
 from groma._typing import FloatArray
 from groma.gates import gate
 
@@ -49,13 +47,16 @@ def merge_collinear(ends: FloatArray, gates: MergeGates = MERGES) -> FloatArray:
     (M, 4) float64
         Pieces that stand alone, unchanged and in order, then the joined ones. M <= N.
     """
+    from scipy.sparse import coo_matrix  # takes a quarter of a second to import
+    from scipy.sparse.csgraph import connected_components
+
     ends = np.asarray(ends, dtype=np.float64)
     if len(ends) < 2:
         return ends.copy()
     start, end = ends[:, :2], ends[:, 2:]
     length = np.maximum(np.linalg.norm(end - start, axis=1), 1e-9)
     along = (end - start) / length[:, None]
-    near = KDTree(end).sparse_distance_matrix(KDTree(start), gates.gap, output_type="coo_matrix")
+    near = kd_tree(end).sparse_distance_matrix(kd_tree(start), gates.gap, output_type="coo_matrix")
     first, second = near.row.astype(np.intp), near.col.astype(np.intp)
     # The next piece must lie ahead, parallel, and on the line of the longer of the two.
     longer = np.where((length[first] >= length[second]), first, second)

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial import KDTree
 
+from groma._trees import kd_tree
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult
@@ -186,7 +186,7 @@ def _segments_at_once(scene: Scene, image: int, segments: Segments, distance: Fl
     s, motion = offsets_of(scene, image_idx, ends)[:, None], motion_of(scene, image_idx)
     nearness = np.zeros(len(ends))
     if len(seen):
-        tree = KDTree(scene.point_observations.pixel[seen])
+        tree = kd_tree(scene.point_observations.pixel[seen])
         _, near = tree.query(ends, k=min(GATES.neighbors, len(seen)))
         nearness = np.mean(1.0 / distance[seen][np.reshape(near, (len(ends), -1))], axis=1)
     turn = quaternion.exp(s * motion[:, 3:])

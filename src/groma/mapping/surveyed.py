@@ -90,11 +90,11 @@ def adjust_surveyed(
     InputError
         If measurements and scene do not fit together.
     """
-    if keep_suspects:
-        scene = with_rejected(scene, ())
     surveyed = (
         with_survey(scene, survey) if survey else Surveyed(scene, Similarity(), WorldFrame("the frame of the scene"))
     )
+    if keep_suspects:
+        surveyed = replace(surveyed, scene=with_rejected(surveyed.scene, ()))
     chosen = weighted(surveyed.scene, options or AdjustOptions())
     result = adjust(surveyed.scene, chosen, progress)
     for _ in range(GATES.max_rounds - 1):
@@ -147,7 +147,7 @@ def adjust_with_survey(points: Scene, options: Any, say: Callable[[str, int, int
 
     told = weighted(points, told)
     if options.keep_suspects:
-        return adjust(points, told, tell).scene
+        return adjust(with_rejected(points, ()), told, tell).scene
     return without_gross_errors(adjust(points, told, tell), lambda scene: adjust(scene, told, tell))[0].scene
 
 

@@ -7,8 +7,6 @@ from dataclasses import fields
 from itertools import combinations
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from groma._typing import IntArray
 from groma.scene.scene import Scene
@@ -22,6 +20,9 @@ def connected_images(scene: Scene) -> list[IntArray]:
 
     Images that see nothing are groups of their own.
     """
+    from scipy.sparse import coo_matrix  # takes a quarter of a second to import
+    from scipy.sparse.csgraph import connected_components
+
     counts = [len(getattr(scene, name)) for name in _NODES]
     first = dict(zip(_NODES, np.cumsum([0, *counts]).tolist(), strict=False))
     pairs = [np.zeros((0, 2), np.int64)]

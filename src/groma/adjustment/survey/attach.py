@@ -25,6 +25,7 @@ from groma.adjustment.survey.triangulate import triangulated
 from groma.adjustment.terms.objects import name_of
 from groma.io.survey import WorldFrame, common_frame
 from groma.scene import PosePriors, Scene, Similarity
+from groma.scene.survey import rejected_rows, with_rejected
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +61,8 @@ def with_survey(scene: Scene, survey: Survey) -> Surveyed:
 
     Positions, poses and control points (not those kept back) determine a robust similarity; distances alone the scale,
     known directions the turn, known planes the turn and the height. A scene that holds such measurements already, or of
-    which something is held, stays where it is.
+    which something is held, stays where it is. Marks that pass by where others of their point meet are rejected until
+    they are tested against the result.
 
     Parameters
     ----------
@@ -89,7 +91,8 @@ def with_survey(scene: Scene, survey: Survey) -> Surveyed:
     found = placing(scene, measured, survey, frame, notes)
     moved = measured.transformed(found.similarity, measured=False)
     if len(moved.control_points):
-        seen, _ = triangulated(moved, moved.marks, len(moved.control_points))
+        seen, agrees = triangulated(moved, moved.marks, len(moved.control_points))
+        moved = _without_strays(moved, agrees)
         known: BoolArray = np.asarray(np.isfinite(seen).all(axis=1))
         points = moved.control_points
         moved = moved.replace(control_points=points.replace(xyz=np.where(known[:, None], seen, points.measured)))
@@ -102,6 +105,17 @@ def with_survey(scene: Scene, survey: Survey) -> Surveyed:
             "nothing beside the measurements."
         )
     return Surveyed(moved, found.similarity, frame, tuple(notes), found.fit)
+
+
+def _without_strays(scene: Scene, agrees: BoolArray) -> Scene:
+    """Return the scene without the marks whose rays pass by where two others of their point meet, for the time being.
+
+    A robust loss is as content with a place behind all cameras, or at infinity, that is a little wrong for every mark.
+    """
+    marks = scene.marks
+    meeting = np.bincount(marks.point_idx[agrees], minlength=len(scene.control_points))
+    strays = np.flatnonzero(~agrees & (meeting[marks.point_idx] >= 2)).tolist()
+    return with_rejected(scene, rejected_rows(scene) | {("marks", row) for row in strays}) if strays else scene
 
 
 def _with_objects(scene: Scene, survey: Survey, notes: list[str]) -> Scene:

@@ -6,7 +6,8 @@ the worst of what the test calls gross errors (:func:`~groma.adjustment.survey.r
 together, the scene is adjusted without them, each is tested against what is left, and the next are taken. Those that
 fit take part again, once for all, and so do those without which hardly anything checks others: of two scale bars that
 contradict each other nobody knows which is wrong, and both keep what the loss leaves them. Nothing is rejected without
-which less of the scene's place, turn and scale would be known.
+which less of the scene's place, turn and scale would be known, nor the second last mark of a point whose coordinates
+take no part: its place would be open.
 
 References: W. Baarda, *A testing procedure for use in geodetic networks*, 1968; W. Foerstner, *Reliability and
 discernability of extended Gauss-Markov models*, 1983, on tests that are correlated.
@@ -15,6 +16,8 @@ discernability of extended Gauss-Markov models*, 1983, on tests that are correla
 from __future__ import annotations
 
 from collections.abc import Callable
+
+import numpy as np
 
 from groma.adjustment.report import AdjustResult
 from groma.adjustment.stages import keeps_loss
@@ -25,7 +28,7 @@ from groma.errors import ProblemError
 from groma.factors.losses import Huber
 from groma.problem.problem import Problem
 from groma.scene import Scene
-from groma.scene.survey import rejected_rows, with_rejected
+from groma.scene.survey import accepted, rejected_rows, with_rejected
 
 #: Standard deviations that no residual has.
 _NEVER = 1e12
@@ -58,7 +61,7 @@ def without_gross_errors(
         wrong = gross_errors(found.measurements)
         returned |= before - wrong.keys()
         kept = before & wrong.keys()
-        doubted = _worst({place: size for place, size in wrong.items() if place not in returned | before})
+        doubted = _worst(result.scene, {place: size for place, size in wrong.items() if place not in returned | before})
         if kept | doubted == before:
             break
         if needed := _needed(result.scene, kept, doubted):
@@ -75,14 +78,21 @@ def without_gross_errors(
     return result, found
 
 
-def _worst(wrong: dict[tuple[str, int], float]) -> set[tuple[str, int]]:
-    """Return the worst of each table: the others may only look wrong beside them."""
+def _worst(scene: Scene, wrong: dict[tuple[str, int], float]) -> set[tuple[str, int]]:
+    """Return the worst of each table, and one mark of a point: the others may only look wrong beside them."""
     most = {table: max(size for (of, _), size in wrong.items() if of == table) for table, _ in wrong}
-    return {place for place, size in wrong.items() if size >= GATES.at_once * most[place[0]]}
+    found: dict[tuple[str, int], tuple[str, int]] = {}
+    for place, size in sorted(wrong.items(), key=lambda one: -one[1]):
+        point = ("point", int(scene.marks.point_idx[place[1]])) if place[0] == "marks" else place
+        if size >= GATES.at_once * most[place[0]]:
+            found.setdefault(point, place)
+    return set(found.values())
 
 
 def _needed(scene: Scene, rejected: set[tuple[str, int]], doubted: set[tuple[str, int]]) -> set[tuple[str, int]]:
-    """Return what of the doubted the place, turn and scale of the scene need, tables as a whole."""
+    """Return what of the doubted the place, turn and scale of the scene need, tables as a whole, or a point."""
+    if lonely := _second_last(scene, rejected | doubted) & doubted:
+        return lonely
     known = num_open_motions(with_rejected(scene, ()))
 
     def opens(rows: set[tuple[str, int]]) -> bool:
@@ -91,6 +101,15 @@ def _needed(scene: Scene, rejected: set[tuple[str, int]], doubted: set[tuple[str
     parts = [{place for place in doubted if place[0] == table} for table in {table for table, _ in doubted}]
     needed = [part for part in parts if opens(part)]
     return set().union(*needed) if needed else doubted if opens(doubted) else set()
+
+
+def _second_last(scene: Scene, rejected: set[tuple[str, int]]) -> set[tuple[str, int]]:
+    """Return the rejected marks of points that are left with fewer than two, and without coordinates."""
+    left = accepted(with_rejected(scene, rejected))
+    count = np.bincount(left.marks.point_idx, minlength=len(left.control_points))
+    open_ = np.flatnonzero((count < 2) & ~left.control_points.is_control)
+    rows = np.flatnonzero(np.isin(scene.marks.point_idx, open_)).tolist()
+    return {("marks", row) for row in rows} & rejected
 
 
 def _no_longer_checked(before: Reliability | None, after: Reliability, size: float) -> set[str]:

@@ -12,18 +12,21 @@ The flow is OpenCV's DIS (Kroeger et al., *Fast optical flow using dense inverse
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array, csr_array
-from scipy.spatial import KDTree
 
+from groma._trees import kd_tree
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.features.images import GrayImage, to_gray
 from groma.features.matches import LineMatches, mutual_best
 from groma.features.segments import Segments
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 Flow = npt.NDArray[np.float32]
 MIN_IMAGE = 16  # pixels; smaller images give DIS no patch to compare
@@ -161,7 +164,7 @@ def _votes(source: Segments, target: Segments, forward: Flow, backward: Flow, op
     heading = heading / np.where(norm > 0.0, norm, np.inf)
 
     ends_at, target_of = _along(target, 2.0)
-    tree = KDTree(ends_at)
+    tree = kd_tree(ends_at)
     rows = np.flatnonzero(ok)
     # The nearest few pieces: where two edges run side by side, only the one that runs the same way gets the vote.
     reach = np.hypot(options.max_distance, 1.0)
@@ -176,6 +179,8 @@ def _votes(source: Segments, target: Segments, forward: Flow, backward: Flow, op
     pick = np.argmin(distance, axis=1)
     voted = np.isfinite(distance[np.arange(len(rows)), pick])
     voter, choice = owner[rows][voted], candidate[np.arange(len(rows)), pick][voted]
+    from scipy.sparse import coo_array  # takes a quarter of a second to import
+
     counts = coo_array((np.ones(len(voter)), (voter, choice)), shape=(len(source), len(target))).tocsr()
     counts.sum_duplicates()
     counts.data /= total[np.repeat(np.arange(len(source)), np.diff(counts.indptr))]

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.spatial import KDTree
 
+from groma._trees import kd_tree
 from groma._typing import FloatArray
 
 #: Up to this many images every pair is matched; beyond it each image is matched with its followers by name (cost: time
@@ -65,7 +65,7 @@ def blocks_of_pairs(
     wanted = min(len(known), _NEAREST + 1)
     if wanted < 2:
         return blocks
-    found = np.asarray(KDTree(places[known]).query(places[known], wanted)[1])
+    found = np.asarray(kd_tree(places[known]).query(places[known], wanted)[1])
     first, second = np.repeat(known, wanted), known[found.ravel()]
     kept = first != second
     if axes is not None:

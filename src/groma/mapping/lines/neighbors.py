@@ -14,15 +14,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import sparse
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_in_threads
 from groma.gates import gate
 from groma.geometry import quaternion
 from groma.scene import Scene
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 
 @dataclass(frozen=True)
@@ -121,6 +124,8 @@ class _Shared:
 
 def _sees(scene: Scene) -> sparse.csr_array:
     """(C, P) one where an image sees a point."""
+    from scipy import sparse  # takes a quarter of a second to import
+
     observations = scene.point_observations
     ones = np.ones(len(observations), np.int32)
     shape = (scene.num_images, scene.num_points)

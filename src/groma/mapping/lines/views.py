@@ -14,9 +14,9 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from groma import cameras as camera_models
+from groma._trees import kd_tree
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_work
 from groma.gates import gate
@@ -209,6 +209,6 @@ def _range_near(ends: FloatArray, pixel: FloatArray, inverse: FloatArray, margin
     first, second = ends[:, :2], ends[:, 2:]
     places = np.stack([first, 0.5 * (first + second), second], axis=1)
     near = min(num_near, len(pixel))
-    found = KDTree(pixel).query(places.reshape(-1, 2), k=near)[1].reshape(len(ends), -1)
+    found = kd_tree(pixel).query(places.reshape(-1, 2), k=near)[1].reshape(len(ends), -1)
     values = inverse[found]
     return np.column_stack([values.min(1) / margin, values.max(1) * margin])

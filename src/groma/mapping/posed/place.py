@@ -29,7 +29,6 @@ from groma.geometry import quaternion, se3
 from groma.io.colmap.at_poses import MIN_MATCHES, PosedPhotographs
 from groma.io.colmap.sfm import PointModelOptions
 from groma.mapping.noise.observations import noise_px
-from groma.mapping.posed.averaging import average_centers, average_rotations
 from groma.mapping.posed.axes import check_axes
 from groma.mapping.posed.motions import Motions, motions_of
 from groma.mapping.posed.noise import GivenNoise, noise_of_given
@@ -156,6 +155,8 @@ def _told(found: Scene, known: GivenPoses | None, near: Similarity | None) -> Pl
 
 def averaged(scene: Scene, motions: Motions) -> tuple[Scene, GivenPoses]:
     """Return the scene with poses that agree with motions too, and what they tell about its own."""
+    from groma.mapping.posed.averaging import average_centers, average_rotations  # sparse matrices are slow to import
+
     poses, centers = scene.cam_from_world, scene.cam_centers_in_world
     turned = average_rotations(poses[:, :4], motions)
     moving = np.bincount(np.concatenate([motions.first, motions.second]), minlength=len(poses)) > 0

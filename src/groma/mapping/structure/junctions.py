@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
 
+from groma._trees import kd_tree
 from groma._typing import FloatArray, IntArray
 from groma.estimators.membership import Candidates, memberships
 from groma.execution import num_threads
@@ -116,7 +116,7 @@ def _neighbours(segments: FloatArray, pixel: FloatArray, gates: JunctionGates) -
     samples = segments[owner, 0] + share[:, None] * (segments[owner, 1] - segments[owner, 0])
     ends = segments.reshape(-1, 3)
     nearest = min(gates.nearest, len(samples))
-    _, index = KDTree(samples).query(ends, k=nearest, workers=num_threads())
+    _, index = kd_tree(samples).query(ends, k=nearest, workers=num_threads())
     one, other = np.repeat(np.arange(len(ends)) // 2, nearest), owner[index.reshape(len(ends), -1)].ravel()
     different = one != other
     low, high = np.minimum(one, other)[different], np.maximum(one, other)[different]

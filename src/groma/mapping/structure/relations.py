@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from scipy.spatial import KDTree
 
+from groma._trees import kd_tree
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.association import inlier_probability
 from groma.estimators.membership import Candidates, memberships
@@ -115,7 +115,7 @@ def spacings(
     places = np.concatenate([points, segments.reshape(-1, 3)])
     if len(places) < 2:
         return np.ones(len(points)), np.ones((len(segments), 2))
-    distance, _ = KDTree(places).query(places, k=min(gates.neighbor + 1, len(places)), workers=num_threads())
+    distance, _ = kd_tree(places).query(places, k=min(gates.neighbor + 1, len(places)), workers=num_threads())
     return distance[: len(points), -1], distance[len(points) :, -1].reshape(-1, 2)
 
 
@@ -289,7 +289,7 @@ def _near_segments(points: FloatArray, segments: FloatArray, gates: RelationGate
     share = (np.arange(len(owner)) - first) / (count[owner] - 1)
     samples = segments[owner, 0] + share[:, None] * (segments[owner, 1] - segments[owner, 0])
     nearest = min(gates.num_nearest, len(samples))
-    _, index = KDTree(samples).query(points, k=nearest, workers=num_threads())
+    _, index = kd_tree(samples).query(points, k=nearest, workers=num_threads())
     return distinct_pairs(np.repeat(np.arange(len(points)), nearest), owner[index.reshape(len(points), -1)].ravel())[0]
 
 

@@ -38,7 +38,7 @@ from groma.tracking.result import map_to_scene
 from groma.tracking.stopwatch import Stopwatch
 
 #: A chosen frame becomes a keyframe, and the result of a window's adjustment is taken up, after this many frames.
-READY, DELAY = 2, 2
+DELAY = 2
 
 
 @dataclass
@@ -166,7 +166,7 @@ class Mapper:
             self.make_keyframe(present, watch)
         with watch("take up"):
             self.take_up(present)
-        if self.due is not None and self.due.is_ready(READY if self.metric else 1):
+        if self.due is not None and self.due.is_ready(DELAY if self.metric else 1):
             self.make_keyframe(present, watch)
         return watch
 

@@ -28,7 +28,7 @@ def drop_repeating_keyframes(track_map: TrackMap, busy: list[Keyframe], gates: C
     used = {keyframe.index for keyframe in busy}
     counts = np.zeros(len(track_map.points), np.int32)
     for keyframe in living:
-        counts[np.unique(keyframe.measured.points.index)] += 1
+        counts[keyframe.measured.points.index] += 1  # once, if a point is there twice
     for k in np.flatnonzero(shared > gates.min_shared):
         keyframe = others[k]
         if (

@@ -5,11 +5,23 @@ from __future__ import annotations
 
 import numpy as np
 
+from groma._numba import loop
 from groma._typing import FloatArray, IntArray
 from groma.tracking.frame.camera import back, planes_back, planes_into
 from groma.tracking.frame.planes import FramePlanes
 from groma.tracking.gates import DEFAULT, PlaneGates
 from groma.tracking.map.landmarks import ALIVE, DEAD, PlaneTable
+
+
+@loop
+def _is_near(samples, places, step, reach):
+    """Whether one of some places, each ``step``-th, is within reach of a sample; samples that are NaN are none."""
+    for i in range(samples.shape[0]):
+        for j in range(0, places.shape[0], step):
+            x, y, z = samples[i, 0] - places[j, 0], samples[i, 1] - places[j, 1], samples[i, 2] - places[j, 2]
+            if x * x + y * y + z * z < reach * reach:
+                return True
+    return False
 
 
 def assign_planes(
@@ -39,8 +51,9 @@ def assign_planes(
     distance = np.abs(in_cam[:, :3] @ centers.T + in_cam[:, 3:])
     good = (cosine > np.cos(max_angle)) & (distance < max_distance)
     score = np.where(good, np.arccos(np.clip(cosine, -1, 1)) / max_angle + distance / max_distance, np.inf)
+    places = back(pose, seen.places) if good.any() else seen.places
     for i, j in np.argwhere(good):
-        if not _overlap(planes.samples[alive[i]], back(pose, seen.places_of(j)), gates):
+        if not _overlap(planes.samples[alive[i]], places[seen.place_plane == j], gates):
             score[i, j] = np.inf
     best = score.argmin(axis=1)
     rows = np.flatnonzero(np.isfinite(score[np.arange(len(alive)), best]))
@@ -68,7 +81,9 @@ def grow(planes: PlaneTable, index: int, places: FloatArray, support: float, gat
     size = gates.box
     while True:
         cells = np.floor(both / size).astype(np.int64)
-        rows = np.unique(cells, axis=0, return_index=True)[1]
+        cells -= cells.min(axis=0, initial=0)
+        most = cells.max(axis=0, initial=0) + 1
+        rows = np.unique((cells[:, 0] * most[1] + cells[:, 1]) * most[2] + cells[:, 2], return_index=True)[1]
         if len(rows) <= planes.samples_kept:
             break
         size *= gates.box_growth
@@ -112,8 +127,4 @@ def _region_means(seen: FramePlanes) -> FloatArray:
 
 
 def _overlap(samples: FloatArray, places: FloatArray, gates: PlaneGates) -> bool:
-    samples = samples[np.isfinite(samples[:, 0])]
-    if not len(samples) or not len(places):
-        return False
-    thinned = places[:: max(1, len(places) // gates.compared)]
-    return bool(np.linalg.norm(samples[:, None] - thinned[None], axis=2).min() < gates.reach)
+    return bool(_is_near(samples, places, max(1, len(places) // gates.compared), gates.reach))
