@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What the compiler is told sooner is what Numba finds out; arguments that are not counted come back as they were."""
+"""What the compiler is told sooner is what Numba finds out; arguments come back as they were."""
 
 import operator
 import sys
@@ -48,7 +48,7 @@ def _until_negative(values):
     return k + last
 
 
-def test_arguments_are_borrowed_and_come_back_as_they_were():
+def test_arguments_come_back_as_they_were():
     values, sizes = np.array([[1.0, 0.0], [3.0, 0.0]]), (np.array([5.0, 7.0]),)
     before = sys.getrefcount(values), sys.getrefcount(sizes[0])
     for _ in range(3):

@@ -21,8 +21,6 @@ from numba.core.debuginfo import DummyDIBuilder
 from numba.core.lowering import Lower
 from numba.core.typed_passes import NativeLowering as NumbaLowering
 
-from groma._kernels.calls import CallWrapper, is_readable
-
 _WORD = llvm.IntType(64)
 _ZERO, _HALF = llvm.Constant(_WORD, 0), llvm.IntType(32)
 #: Places in an array's description (Numba's format).
@@ -98,19 +96,6 @@ class _Lower(Lower):
         if not self._is_plain:
             return super().alloca_lltype(name, lltype, datamodel)
         return cgutils.alloca_once(self.builder, lltype, name=name, zfill=False)
-
-    def create_cpython_wrapper(self, release_gil: bool = False) -> None:
-        """Make what Python calls, by short code where nothing of an argument can be returned."""
-        said = self.fndesc
-        if self.genlower or self._is_counted(said.restype) or not all(map(is_readable, said.argtypes)):
-            super().create_cpython_wrapper(release_gil)
-            return
-        context = self.context.subtarget(enable_nrt=False)
-        module = context.create_module("wrapper")
-        kind = context.call_conv.get_function_type(said.restype, said.argtypes)
-        function = llvm.Function(module, kind, said.llvm_func_name)
-        CallWrapper(context, module, function, said, self.env, self.call_helper, release_gil).build()
-        self.library.add_ir_module(module)
 
     def lower_expr(self, resty: Any, expr: Any) -> Any:
         """Spare arrays the search for code for fixed indices, of which there is none."""
