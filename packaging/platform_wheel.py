@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Build a wheel that brings compiled functions along, so that the first command is as fast as the second.
 
-    python packaging/platform_wheel.py [--baseline x86-64-v3] [-o dist]
+    python packaging/platform_wheel.py [--baseline x86-64-v3] [--platform manylinux_2_17_x86_64] [-o dist]
 
 Run it with the Python, NumPy, Numba and llvmlite that the wheel is for: compiled functions hold for their versions and
 for processors that have all instructions of the baseline. Elsewhere they are ignored, and groma compiles as ever.
@@ -89,9 +89,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--baseline", choices=tuple(BASELINES), default="x86-64-v3")
     parser.add_argument("--output", "-o", type=Path, default=ROOT / "dist", metavar="DIR")
+    platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
+    parser.add_argument("--platform", default=platform, help="as in the name of the wheel; no system library is linked")
     arguments = parser.parse_args()
     python = f"cp{sys.version_info[0]}{sys.version_info[1]}"
-    platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "-w", place, os.fspath(ROOT)]
@@ -100,7 +101,7 @@ def main() -> int:
         with zipfile.ZipFile(pure) as wheel:
             wheel.extractall(folder / "unpacked")
         count = compile_into(folder / "unpacked" / "groma", arguments.baseline)
-        made = pack(folder / "unpacked", arguments.output, f"{python}-{python}-{platform}")
+        made = pack(folder / "unpacked", arguments.output, f"{python}-{python}-{arguments.platform}")
         sizes = [path.stat().st_size / 1e6 for path in (pure, made)]
     print(
         f"{made}: {count} compiled functions for {arguments.baseline}, {sizes[1]:.1f} MB instead of {sizes[0]:.1f} MB"

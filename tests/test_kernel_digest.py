@@ -21,6 +21,8 @@ from numba.extending import overload
 import groma
 from groma._kernels import cache as kernel_cache
 from groma._kernels import digest as kernel_digest
+from groma._kernels import inner as kernel_inner
+from groma._kernels.calls import CallWrapper
 from groma.cameras import dispatch as _dispatch
 
 pytestmark = [
@@ -375,6 +377,32 @@ def test_versions_and_settings_count(monkeypatch):
     before = kernel_digest.environment()
     monkeypatch.setattr(numba.config, "BOUNDSCHECK", 1)
     assert kernel_digest.environment() != before
+
+
+def test_our_part_of_the_compiler_counts(monkeypatch, tmp_path):
+    before = kernel_digest.environment()
+    for name in kernel_digest.COMPILER:
+        (tmp_path / name).write_bytes(Path(kernel_digest.__file__).with_name(name).read_bytes())
+    monkeypatch.setattr(kernel_digest, "__file__", str(tmp_path / "digest.py"))
+    same = [_environment_anew()]
+    for name in kernel_digest.COMPILER:
+        (tmp_path / name).write_bytes((tmp_path / name).read_bytes() + b"# edited")
+        same.append(_environment_anew())
+    kernel_digest._compiler.cache_clear()
+    assert same[0] == before
+    assert len({*same}) == 1 + len(kernel_digest.COMPILER)
+
+
+def test_all_that_replaces_parts_of_the_compiler_is_in_it():
+    parts = [CallWrapper, kernel_inner.Pipeline, kernel_inner._Library, *kernel_inner.OURS.values()]
+    parts += [step.lowering_class.fget(None) for step in parts if hasattr(step, "lowering_class")]
+    files = {Path(sys.modules[part.__module__].__file__).name for part in parts}
+    assert files == {*kernel_digest.COMPILER}
+
+
+def _environment_anew():
+    kernel_digest._compiler.cache_clear()
+    return kernel_digest.environment()
 
 
 def test_all_of_groma_can_be_followed():

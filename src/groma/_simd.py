@@ -4,9 +4,9 @@ r"""Small dense block products as explicit vector instructions.
 Bundle adjustment spends its time in products of tiny blocks (3x9, 9x9). LLVM does not vectorise Numba's loops over
 them, because a store might alias a load. Here the blocks are loaded into vector registers by hand.
 
-Block sizes must be known when a loop is compiled. They are passed as *widths*: a tuple of zeros whose length is the
-size, ``width(9) == (0,) * 9``. The size is then part of the argument's type, so one loop at module level is compiled
-once for each size and cached on disk as such.
+Block sizes must be known when a loop is compiled. They are passed as *widths*: a tuple of ``None`` whose length is
+the size, ``width(9) == (None,) * 9``. The size is then part of the argument's type, so one loop at module level is
+compiled once for each size and cached on disk as such.
 
 With ``NUMBA_DISABLE_JIT=1`` the same names are plain NumPy.
 """
@@ -25,9 +25,9 @@ _I32, _I64 = ir.IntType(32), ir.IntType(64)
 _DOUBLE = ir.DoubleType()
 
 
-def width(size: int) -> tuple[int, ...]:
+def width(size: int) -> tuple[None, ...]:
     """Return the tuple whose type tells a compiled loop the block size."""
-    return (0,) * size
+    return (None,) * size
 
 
 class _Vectors:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Poses from matches: exact where matches are, as uncertain as stated, refused where there is nothing in it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -233,6 +234,23 @@ def _in_pieces(world, rng, moved):
     wrong = rng.permutation(len(half))[: len(half) // 4]
     points2d[wrong] = rng.uniform((0, 0), (CAMERA.width, CAMERA.height), (len(wrong), 2))
     return points2d
+
+
+@pytest.mark.parametrize(("kinds", "share"), [("points", 1.04), ("points lines", 0.96), ("points lines", 1.0)])
+def test_a_wrong_focal_length_is_noticed(kinds, share):
+    """It is told where it is wrong, and not where it is right or estimated."""
+    rng, share = np.random.default_rng(21), np.array([share, share, 1.0, 1.0])
+    world = make_world(rng, points=150, lines=40)
+    world.points2d[:] += rng.normal(0.0, 0.5, world.points2d.shape)
+    told = replace(CAMERA, params=CAMERA.params * share)
+    found = of(world, kinds.split(), told, sigma=(0.5, 0.5))
+    wrong = share[0] != 1.0
+    assert (found.status, "focal length" in found.sentence) == (("uncertain", True) if wrong else ("localized", False))
+    if wrong:
+        assert ("shorter" if share[0] > 1.0 else "longer") in found.sentence
+    estimated = of(world, kinds.split(), told, sigma=(0.5, 0.5), options=PoseOptions(refine_lens=True))
+    assert estimated.status == "localized"
+    np.testing.assert_allclose(estimated.camera.params[:2], CAMERA.params[:2], rtol=0.01)
 
 
 def test_what_is_put_together_of_pieces_is_not_believed():

@@ -10,7 +10,8 @@ as nothing of this changed:
   the functions registered with ``numba.extending.overload``, classes, numbers, strings, tuples, arrays. Of a module
   those attributes count whose names occur in the code;
 - of a table :class:`ByLength`, such as the kernels of camera models, the entries that the argument types select;
-- the versions of Python, Numba, llvmlite and NumPy, for everything that is theirs, and Numba's settings.
+- the versions of Python, Numba, llvmlite and NumPy, for everything that is theirs, and Numba's settings;
+- the files that change Numba's compiler (``COMPILER``), byte by byte.
 
 Names are taken wherever they occur in the code, also where they are attributes of something else, so that too much
 counts rather than too little. What cannot be followed (an instance of some class, ``getattr`` in an overload) stands
@@ -59,6 +60,8 @@ _T = TypeVar("_T")
 
 #: Settings of Numba that change the code, besides the processor.
 _SETTINGS = ("OPT", "BOUNDSCHECK", "DEBUGINFO_DEFAULT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "USING_SVML")
+#: Files of this room that decide what code comes out of a function.
+COMPILER = ("calls.py", "elements.py", "inner.py", "shortcuts.py")
 _CHANGE_IN_PLACE = (list, dict, set, np.ndarray)
 
 
@@ -91,9 +94,10 @@ def dependence(function: Any, argument_types: tuple) -> Dependence:
 
 
 def environment() -> tuple:
-    """Return versions and settings that everything compiled depends on."""
+    """Return versions and settings that everything compiled depends on, and a digest of our part of the compiler."""
     settings = tuple(repr(getattr(config, name, None)) for name in _SETTINGS)
-    return sys.version_info[:2], numba.__version__, llvmlite.__version__, np.__version__, settings
+    versions = sys.version_info[:2], numba.__version__, llvmlite.__version__, np.__version__
+    return *versions, settings, _compiler()
 
 
 # --------------------------------------------------------------------------------------------------------- The graph
@@ -106,7 +110,7 @@ class _Reach:
     text: str
     #: What can change in place, and tables.
     late: tuple[Any, ...]
-    #: Lengths of tuples of zeros among the constants, which select from tables as well.
+    #: Lengths of tuples of nothing among the constants, which select from tables as well.
     lengths: frozenset[int]
     packages: frozenset[str]
     is_opaque: bool
@@ -277,7 +281,18 @@ def _stamp(package: str) -> str:
     folders = [Path(folder) for folder in getattr(module, "__path__", ())]
     files = [path for folder in folders for path in folder.rglob("*") if path.suffix in (".py", ".so", ".pyd")]
     file = getattr(module, "__file__", None)
+    return _content(sorted(files) or [Path(file or "")])
+
+
+@cache
+def _compiler() -> str:
+    """Return a digest of our part of the compiler."""
+    return _content([Path(__file__).with_name(name) for name in COMPILER])
+
+
+def _content(files: list[Path]) -> str:
+    """Return a digest of files; another each time where they cannot be read."""
     try:
-        return _hash([path.read_bytes() for path in sorted(files) or [Path(file or "")]])
+        return _hash([path.read_bytes() for path in files])
     except OSError:
         return uuid.uuid4().hex

@@ -11,13 +11,17 @@ Whatever is not one number of an array by integers goes the way of Numba, and so
 
 from __future__ import annotations
 
+from functools import cache, cached_property
 from typing import Any
 
 from llvmlite import ir as llvm
-from numba.core import types
+from numba.core import cgutils, types
 from numba.core.compiler_machinery import register_pass
+from numba.core.debuginfo import DummyDIBuilder
 from numba.core.lowering import Lower
 from numba.core.typed_passes import NativeLowering as NumbaLowering
+
+from groma._kernels.calls import CallWrapper, is_readable
 
 _WORD = llvm.IntType(64)
 _ZERO, _HALF = llvm.Constant(_WORD, 0), llvm.IntType(32)
@@ -43,8 +47,70 @@ def _item(value: Any, place: int) -> Any:
     return None
 
 
+@cache
+def _is_counted(models: Any, kind: Any) -> bool:
+    return models[kind].contains_nrt_meminfo()
+
+
 class _Lower(Lower):
-    """Numba's, with short code for numbers of arrays."""
+    """Numba's, with short code for numbers of arrays and for variables without a count of references."""
+
+    @cached_property
+    def _is_plain(self) -> bool:
+        """Whether nobody wants to look at variables in a debugger."""
+        return type(self.debuginfo) is DummyDIBuilder
+
+    def _is_counted(self, kind: Any) -> bool:
+        """Whether something of a type has a count of references."""
+        return _is_counted(self.context.data_model_manager, kind)
+
+    def incref(self, typ: Any, val: Any) -> None:
+        """Count a reference, where there is something to be counted."""
+        if self._is_counted(typ):
+            super().incref(typ, val)
+
+    def decref(self, typ: Any, val: Any) -> None:
+        """Count one reference less, where there is something to be counted."""
+        if self._is_counted(typ):
+            super().decref(typ, val)
+
+    def storevar(self, value: Any, name: str, argidx: int | None = None) -> None:
+        """Store a number without reading what was there before."""
+        kind = self.typeof(name)
+        if not self._is_plain or (argidx is None and self._is_counted(kind)):
+            super().storevar(value, name, argidx)
+            return
+        self._alloca_var(name, kind)
+        if name in self._singly_assigned_vars and not self._disable_sroa_like_opt:
+            self._blk_local_varmap[name] = value
+        else:
+            self.builder.store(value, self.getvar(name))
+
+    def delvar(self, name: str) -> None:
+        """Forget an array; a number may stay where it is."""
+        if self._is_counted(self.typeof(name)):
+            super().delvar(name)
+        elif name not in self._blk_local_varmap:
+            self._singly_assigned_vars.discard(name)
+
+    def alloca_lltype(self, name: str, lltype: Any, datamodel: Any = None) -> Any:
+        """Make room for a variable, without asking LLVM how much of it a debugger should show."""
+        if not self._is_plain:
+            return super().alloca_lltype(name, lltype, datamodel)
+        return cgutils.alloca_once(self.builder, lltype, name=name, zfill=False)
+
+    def create_cpython_wrapper(self, release_gil: bool = False) -> None:
+        """Make what Python calls, by short code where nothing of an argument can be returned."""
+        said = self.fndesc
+        if self.genlower or self._is_counted(said.restype) or not all(map(is_readable, said.argtypes)):
+            super().create_cpython_wrapper(release_gil)
+            return
+        context = self.context.subtarget(enable_nrt=False)
+        module = context.create_module("wrapper")
+        kind = context.call_conv.get_function_type(said.restype, said.argtypes)
+        function = llvm.Function(module, kind, said.llvm_func_name)
+        CallWrapper(context, module, function, said, self.env, self.call_helper, release_gil).build()
+        self.library.add_ir_module(module)
 
     def lower_expr(self, resty: Any, expr: Any) -> Any:
         """Spare arrays the search for code for fixed indices, of which there is none."""

@@ -23,12 +23,14 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.core.compiler_machinery import PassManager
 from numba.core.sigutils import normalize_signature
 from numba.core.typed_passes import NativeLowering as NumbaLowering
+from numba.core.typed_passes import NopythonTypeInference
 
 from groma._kernels.elements import NativeLowering
 from groma._kernels.loading import rebuilt
+from groma._kernels.shortcuts import TypeInference
 
 #: Steps of Numba's compiler, and what takes their place.
-OURS = {NumbaLowering: NativeLowering}
+OURS = {NumbaLowering: NativeLowering, NopythonTypeInference: TypeInference}
 #: How the names of wrappers begin.
 _WRAPPER = "_ZN7cpython"
 #: How many functions are being compiled: one inside the other. Numba compiles in one thread at a time.

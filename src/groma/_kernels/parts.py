@@ -58,7 +58,7 @@ class Part:
     others: list[tuple[str, Any]] = field(default_factory=list)
     #: Namespaces and closure cells, names, and what was found there.
     reads: list[tuple[Any, str, Any]] = field(default_factory=list)
-    #: Lengths of the tuples of zeros among its constants.
+    #: Lengths of the tuples of nothing, ``None`` or zero, among its constants.
     lengths: set[int] = field(default_factory=set)
     #: The package it is from; empty for values.
     package: str = ""
@@ -259,16 +259,16 @@ def _imports(code: CodeType) -> list[str]:
 
 
 def _zeros(value: Any) -> Iterable[int]:
-    """Yield the lengths of the tuples of zeros in a value, which may select from a table."""
+    """Yield the lengths of the tuples of nothing in a value, which may select from a table."""
     if type(value) is tuple and value:
-        if all(type(item) in _NUMBERS and item == 0 for item in value):
+        if all(item is None or (type(item) in _NUMBERS and item == 0) for item in value):
             yield len(value)
         for item in value:
             yield from _zeros(item)
 
 
 def _written_zeros(code: CodeType) -> Iterable[int]:
-    """Yield the lengths of tuples of zeros written in code, other than in ``J[0, 0]`` and ``x, y = 0, 0``."""
+    """Yield the lengths of tuples of nothing written in code, other than in ``J[0, 0]`` and ``x, y = 0, 0``."""
     for number, constant in enumerate(code.co_consts):
         lengths = list(_zeros(constant))
         if lengths and (type(constant[0]) is tuple or number > 255 or _is_kept(code.co_code, number)):

@@ -104,14 +104,14 @@ class CameraModel:
         return len(self.parameter_names)
 
     @property
-    def tag(self) -> tuple[int, ...]:
+    def tag(self) -> tuple[None, ...]:
         """What compiled loops take to select this model, see :mod:`groma.cameras.dispatch`."""
         if self.number < 0:
             raise InputError(
                 f"The camera model {self.name!r} has no kernels yet. Use the model that "
                 "groma.cameras.register_camera returns."
             )
-        return (0,) * (self.number + 1)
+        return (None,) * (self.number + 1)
 
     @property
     def known_indices(self) -> tuple[int, ...]:

@@ -2,7 +2,7 @@
 r"""How compiled code calls the kernels of the right camera model.
 
 Loops that project points (the factors) do not know the model. They take :attr:`groma.cameras.CameraModel.tag` as an
-argument, a tuple of zeros whose length is one more than the number of the model. Numba compiles a loop per argument
+argument, a tuple of ``None`` whose length is one more than the number of the model. Numba compiles a loop per argument
 type, and the length is part of the type, so the loop calls the model's kernel directly: no branch, no function
 pointer, and Numba's disk cache works. Without the compiler the same names are plain Python functions::
 

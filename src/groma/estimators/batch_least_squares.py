@@ -25,7 +25,7 @@ A kind of problem is three kernels, and is registered with a number (:func:`prob
 An observation has a row of numbers of its own, ``own[m]`` (a segment), and one that it may share with others,
 ``shared[k]`` (its camera). The arrays are passed whole: views of rows would take half of the time.
 
-The loop takes the kind as a tuple of zeros whose length is the number, so it is compiled for each kind and calls the
+The loop takes the kind as a tuple of ``None`` whose length is the number, so it is compiled for each kind and calls the
 kernels directly, as :mod:`groma.cameras.dispatch` does for camera models.
 """
 

@@ -27,8 +27,8 @@ the cost above has the factor one half). It runs through the others: :math:`\alp
 0 is cauchy(:math:`\sqrt2 c`), -2 is geman_mcclure(2c).
 
 A loss is a kernel and a frozen dataclass whose fields are the kernel's parameters, made known by :func:`register_loss`,
-here or in another package. Compiled loops take its :attr:`Loss.tag`, a tuple of zeros whose length selects the kernel
-while they are compiled, as with camera models (:mod:`groma.cameras.dispatch`): no branch is left in them.
+here or in another package. Compiled loops take its :attr:`Loss.tag`, a tuple of ``None`` whose length selects the
+kernel while they are compiled, as with camera models (:mod:`groma.cameras.dispatch`): no branch is left in them.
 """
 
 from __future__ import annotations
@@ -182,11 +182,11 @@ class Loss:
             )
 
     @property
-    def tag(self) -> tuple[int, ...]:
+    def tag(self) -> tuple[None, ...]:
         """What compiled loops take to select this loss."""
         if self.number < 0:
             raise InputError(f"The loss {type(self).__name__} has no kernel yet. Decorate it with register_loss.")
-        return (0,) * (self.number + 1)
+        return (None,) * (self.number + 1)
 
     @property
     def parameters(self) -> tuple[float, ...]:

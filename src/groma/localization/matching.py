@@ -200,7 +200,7 @@ def pairs_near(
     cells = cell.max(axis=0) + 2
     number = cell[:, 1] * cells[0] + cell[:, 0]
     order = np.argsort(number, kind="stable")
-    begin = np.searchsorted(number[order], np.arange(int(cells[0] * cells[1]) + 1))
+    begin = np.concatenate([[0], np.cumsum(np.bincount(number, minlength=int(cells[0] * cells[1])))])
     least, room = 1.0 - 0.5 * gates.distance**2, 4 * len(here)
     while True:
         rows, columns, far = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room)

@@ -87,7 +87,7 @@ def linearize_pixels(
 ):  # fmt: skip
     """Write one row for each of the ``pixels`` of a line: the two ends of a segment (N, 4), or one point on it (N, 2).
 
-    ``row_tag`` has a number for each row: its length is part of its type, so that Numba knows it.
+    ``row_tag`` is a tuple with ``None`` for each row: its length is part of its type, so that Numba knows it.
     """
     size, rows = intrinsics.shape[1], len(row_tag)
     L, K, J_K, params, out = np.empty(6), np.empty(4), np.empty((4, size)), np.empty(size), np.empty((2, 8))
@@ -150,7 +150,7 @@ class LineReprojection(PixelFactor):
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
-        arguments = self.arguments(inputs, self.line, (0, 0), self.segments)
+        arguments = self.arguments(inputs, self.line, (None, None), self.segments)
         return linearize_pixels(*arguments, begin, end, *columns, record)
 
     @classmethod

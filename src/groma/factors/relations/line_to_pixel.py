@@ -47,7 +47,7 @@ class LineToPixel(PixelFactor):
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
-        arguments = self.arguments(inputs, self.line, (0,), self.pixels)
+        arguments = self.arguments(inputs, self.line, (None,), self.pixels)
         return linearize_pixels(*arguments, begin, end, *columns, record)
 
     @classmethod

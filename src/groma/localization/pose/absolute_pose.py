@@ -16,6 +16,7 @@ import numpy.typing as npt
 from groma._typing import BoolArray, FloatArray
 from groma.geometry import quaternion
 from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.focal_length import focal_step
 from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import max_errors, propose, straightened
 from groma.localization.pose.matches import Matches
@@ -28,6 +29,7 @@ from groma.localization.pose.verdict import (
     doubted_if_in_pieces,
     doubted_if_mirrored,
     doubted_if_missing,
+    doubted_if_other_lens,
     doubted_if_repeated,
     evidence_of,
     judge,
@@ -221,6 +223,8 @@ def pose_from_matches(
         verdict = doubted_if_repeated(doubted_if_missing(verdict, *parts), alone)
     if mirror is not None and verdict.status == "localized":
         verdict = _unless_mirrored(verdict, own, mirror, matches, options)
+    if not options.refine_lens and verdict.status == "localized":
+        verdict = doubted_if_other_lens(verdict, *focal_step(best, used))
     failed = verdict.status == "failed"
     return AbsolutePose(
         verdict.status,

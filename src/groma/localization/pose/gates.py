@@ -75,6 +75,10 @@ class VerdictGates:
         0.5, "share", "of how often all points are found, that unique ones are found",
         "derived from the two places: one here, nothing in another",
     )  # fmt: skip
+    focal: float = gate(
+        0.01, "share", "of the focal length: a step of its estimate that tells another lens", "convention: a hundredth"
+    )
+    focal_noise: float = gate(5.0, "sigma", "that such a step must have", "convention: five sigma, of a discovery")
     bend: float = gate(
         0.15, "share", "of their distance, by which neighbours may be off differently",
         "derived from perspective: as between views 10 degrees apart",

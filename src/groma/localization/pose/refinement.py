@@ -231,7 +231,7 @@ def refine(
     ]
     near: tuple[BoolArray, BoolArray] | None = None
     for round_ in range(gates.rounds + 1):
-        weighted = _with_landmarks(problem, matches)
+        weighted = with_landmarks(problem, matches)
         squares = residual_squares_of(weighted, matches)
         wide = gathered and round_ == 0
         before, near = near, (wide | (squares[0] <= limits[0]), wide | (squares[1] <= limits[1]))
@@ -249,7 +249,7 @@ def refine(
     pose = problem.variables["frames"].state[0]
     if refine_lens:
         problem = problem_of(camera, matches, pose, False)
-    return _fitted(_with_landmarks(problem, matches), camera, matches, max_error, refine_lens, gates)
+    return _fitted(with_landmarks(problem, matches), camera, matches, max_error, refine_lens, gates)
 
 
 def _agreeing(squares: tuple[FloatArray, FloatArray], gates: RefinementGates) -> int:
@@ -273,7 +273,7 @@ def fitted(
     gates: RefinementGates = REFINEMENT,
 ) -> Refined:
     """Say which matches agree with a pose as it is; parameters as of :func:`refine`."""
-    problem = _with_landmarks(problem_of(camera, matches, pose, False), matches)
+    problem = with_landmarks(problem_of(camera, matches, pose, False), matches)
     return _fitted(problem, camera, matches, max_error, refine_lens, gates)
 
 
@@ -337,7 +337,7 @@ def problem_of(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_l
     return assemble(scene, replace(_ASSEMBLY, refine_intrinsics=refine_lens)).problem
 
 
-def _with_landmarks(problem: Problem, matches: Matches) -> Problem:
+def with_landmarks(problem: Problem, matches: Matches) -> Problem:
     """Return a problem whose noise holds that of its landmarks, too, as they are seen from where its pose is."""
     covariances = {"points": matches.point_covariance, "lines": matches.line_covariance}
     return Problem(problem.variables, [_widened(problem, factor, covariances) for factor in problem.factors])

@@ -197,6 +197,19 @@ def doubted_if_repeated(verdict: Verdict, often: float, gates: VerdictGates = VE
     return Verdict("uncertain", 1.0 - gates.right, words)
 
 
+def doubted_if_other_lens(verdict: Verdict, step: float, sigma: float, gates: VerdictGates = VERDICT) -> Verdict:
+    """Return a verdict, or ``uncertain`` where what agrees asks for another focal length: a step of its estimate, as a
+    share of it, is large beside its standard deviation.
+    """
+    if verdict.status != "localized" or abs(step) <= max(gates.focal, gates.focal_noise * sigma):
+        return verdict
+    words = (
+        f"{verdict.sentence} But they fit a {'longer' if step > 0.0 else 'shorter'} focal length better: the "
+        "calibration is not that of this photograph. Pass its own, or let it be estimated (--calibration unknown)."
+    )
+    return Verdict("uncertain", 1.0 - gates.right, words)
+
+
 def votes_of_a_rival(agree: int, gates: VerdictGates = VERDICT) -> int:
     """How many cells must agree with another place for it to make one with so many doubtful."""
     votes = np.arange(agree + 1)

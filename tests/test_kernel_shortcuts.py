@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What the compiler is told sooner is what Numba finds out; arguments that are not counted come back as they were."""
+
+import operator
+import sys
+
+import numba
+import numpy as np
+import pytest
+from numba.core import types
+from numba.core.registry import cpu_target
+
+from groma._kernels import shortcuts
+from groma._numba import loop
+from groma._simd import width
+
+pytestmark = [
+    pytest.mark.kernels,
+    pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled"),
+]
+
+
+@loop
+def _longest(values, sizes, _shape):
+    best = -1.0
+    for i in range(values.shape[0]):
+        row = values[i]
+        best = max(best, row[0] * row[0] + sizes[0][i])
+    return best
+
+
+@loop
+def _given_back(values):
+    return values, values[1:]
+
+
+@loop
+def _until_negative(values):
+    k = 0
+    for i in range(values.shape[0]):
+        step = values[i]
+        if step < 0.0:
+            k = i
+            break
+        last = step
+    else:
+        last = 0.0
+    return k + last
+
+
+def test_arguments_are_borrowed_and_come_back_as_they_were():
+    values, sizes = np.array([[1.0, 0.0], [3.0, 0.0]]), (np.array([5.0, 7.0]),)
+    before = sys.getrefcount(values), sys.getrefcount(sizes[0])
+    for _ in range(3):
+        assert _longest(values, sizes, width(3)) == 16.0
+    assert (sys.getrefcount(values), sys.getrefcount(sizes[0])) == before
+
+
+@loop
+def _of_each_kind(number, single, count, short, is_set, nothing, pairs):
+    (first, second), third = pairs
+    total = number + single + count + short + first + second[0] + third
+    return total if is_set and nothing is None else -total
+
+
+def test_arguments_of_each_kind():
+    pairs = (1, np.array([2.0])), 4.0
+    for count in (8, np.int64(8), True):
+        found = _of_each_kind(0.5, np.float32(0.25), count, np.int16(-16), np.bool_(True), None, pairs)
+        assert found == 0.5 + 0.25 + int(count) - 16 + 1 + 2 + 4
+    assert _of_each_kind(np.float64(1.0), np.float32(0.0), 2**40, np.int16(0), False, None, pairs) == -(8.0 + 2**40)
+
+
+def test_what_is_returned_of_an_argument_outlives_it():
+    values = np.arange(1000.0)
+    whole, part = _given_back(values)
+    assert whole is values
+    before = part.copy()
+    del values, whole
+    np.full(1000, -1.0)  # would take the memory
+    np.testing.assert_array_equal(part, before)
+
+
+def test_numbers_that_are_set_in_one_branch_only():
+    assert _until_negative(np.array([2.0, 3.0, -1.0])) == 2 + 3.0
+    assert _until_negative(np.array([2.0, 3.0])) == 0.0
+
+
+def test_operators_mean_what_they_mean_to_numba():
+    context = cpu_target.typing_context
+    context.refresh()
+    add = context.resolve_value_type(operator.add)
+    for one in (types.float64, types.int64, types.float32, types.boolean, types.float64[::1]):
+        for other in (types.float64, types.int64, types.literal(3)):
+            meant = context.resolve_function_type(add, (one, other), {})
+            for _ in range(2):
+                assert shortcuts._Typing(context).resolve_function_type(add, (one, other), {}) == meant
