@@ -181,7 +181,7 @@ def test_loss_chart_solver_and_format_by_name_on_the_command_line(python, tmp_pa
 
 
 def test_photographs_are_mapped_with_its_detector_and_matcher(python, tmp_path):
-    scene = facade(tmp_path / "photos", 3)
+    scene = facade(tmp_path / "photos", 4)
     write_scene(scene, tmp_path / "model.npz")
     options = ["--model", "model.npz", "--no-planes", "--no-diagnosis", "--line-matcher", "nearest"]
     commands = ["map", "photos", "-o", "out", *options, "--line-detector", "hough"], ["map", "photos", "-o", "no"]
