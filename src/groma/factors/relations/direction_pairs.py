@@ -133,23 +133,21 @@ class DirectionPair(Factor):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Parallel(DirectionPair):
+class _Pair(DirectionPair):
     #: The one variable.
     first: Ref
     #: The other variable.
     second: Ref
 
+
+@dataclass(frozen=True, kw_only=True)
+class _Parallel(_Pair):
     rows: ClassVar[int] = 3
     independent_rows: ClassVar[int] = 2
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Orthogonal(DirectionPair):
-    #: The one variable.
-    first: Ref
-    #: The other variable.
-    second: Ref
-
+class _Orthogonal(_Pair):
     rows: ClassVar[int] = 1
 
 
