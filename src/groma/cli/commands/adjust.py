@@ -79,9 +79,9 @@ def adjust(
         bool, _options.CAMERAS.option("Estimate where the cameras sit on their rig.", "--refine-rigs")
     ] = False,
     rolling_shutter: _options.RollingShutter = None,
-    points: Annotated[bool, _options.ADJUSTMENT.option("Use points.", "--points/--no-points")] = True,
-    lines: Annotated[bool, _options.ADJUSTMENT.option("Use lines.", "--lines/--no-lines")] = True,
-    planes: Annotated[bool, _options.ADJUSTMENT.option("Use planes.", "--planes/--no-planes")] = True,
+    points: Annotated[bool, _options.ADJUSTMENT.option("Use points.")] = True,
+    lines: Annotated[bool, _options.ADJUSTMENT.option("Use lines.")] = True,
+    planes: Annotated[bool, _options.ADJUSTMENT.option("Use planes.")] = True,
     max_iterations: Annotated[
         int | None,
         _options.ADJUSTMENT.option("Stop after N steps. Default: 50, for pose graphs 100.", min=0, metavar="N"),
@@ -151,10 +151,7 @@ def adjust(
         ),
     ] = 1.0,
     diagnosis: Annotated[
-        bool | None,
-        _options.RESULTS.option(
-            "Say what the data do not determine. Default: yes up to 300 images.", "--diagnosis/--no-diagnosis"
-        ),
+        bool | None, _options.RESULTS.option("Say what the data do not determine. Default: yes up to 300 images.")
     ] = None,
     keep: Annotated[
         Keep,

@@ -112,9 +112,7 @@ def map_(
             "Leave out lines less probably right than this; 0 keeps all.", min=0.0, max=1.0, metavar="P"
         ),
     ] = 0.5,
-    planes: Annotated[
-        bool, _options.LANDMARKS.option("Look for planes and directions.", "--planes/--no-planes")
-    ] = True,
+    planes: Annotated[bool, _options.LANDMARKS.option("Look for planes and directions.")] = True,
     refine_poses: Annotated[
         bool, _options.ADJUSTMENT.option("Move the cameras too, or the landmarks alone.", "--refine-poses/--fix-poses")
     ] = True,
@@ -135,10 +133,7 @@ def map_(
         ),
     ] = False,
     diagnosis: Annotated[
-        bool | None,
-        _options.ADJUSTMENT.option(
-            "Say what the data do not determine. Default: yes up to 300 images.", "--diagnosis/--no-diagnosis"
-        ),
+        bool | None, _options.ADJUSTMENT.option("Say what the data do not determine. Default: yes up to 300 images.")
     ] = None,
     measured: _measured.Measured = _measured.NOTHING,
     depth: _depth.Depth = None,
