@@ -99,7 +99,9 @@ def with_common_options(command: Callable[..., None]) -> Callable[..., None]:
     itself, too, is given to both.
     """
     own, common = inspect.signature(command, eval_str=True), inspect.signature(console_of, eval_str=True).parameters
-    groups = {name: one.annotation for name, one in own.parameters.items() if is_dataclass(one.annotation)}
+    groups: dict[str, Any] = {
+        name: one.annotation for name, one in own.parameters.items() if is_dataclass(one.annotation)
+    }
     listed = [
         one
         for name, parameter in own.parameters.items()
