@@ -22,7 +22,6 @@ import groma
 from groma._kernels import cache as kernel_cache
 from groma._kernels import digest as kernel_digest
 from groma._kernels import inner as kernel_inner
-from groma._kernels import wrappers as kernel_wrappers
 from groma.cameras import dispatch as _dispatch
 
 pytestmark = [
@@ -394,7 +393,7 @@ def test_our_part_of_the_compiler_counts(monkeypatch, tmp_path):
 
 
 def test_all_that_replaces_parts_of_the_compiler_is_in_it():
-    parts = [kernel_inner.Pipeline, kernel_inner._Library, kernel_wrappers._Wrapper, *kernel_inner.OURS.values()]
+    parts = [kernel_inner.Pipeline, kernel_inner._Library, *kernel_inner.OURS.values()]
     parts += [step.lowering_class.fget(None) for step in parts if hasattr(step, "lowering_class")]
     files = {Path(sys.modules[part.__module__].__file__).name for part in parts}
     assert files == {*kernel_digest.COMPILER}

@@ -21,8 +21,6 @@ from numba.core.debuginfo import DummyDIBuilder
 from numba.core.lowering import Lower
 from numba.core.typed_passes import NativeLowering as NumbaLowering
 
-from groma._kernels.wrappers import add_wrapper
-
 _WORD = llvm.IntType(64)
 _ZERO, _HALF = llvm.Constant(_WORD, 0), llvm.IntType(32)
 #: Places in an array's description (Numba's format).
@@ -98,13 +96,6 @@ class _Lower(Lower):
         if not self._is_plain:
             return super().alloca_lltype(name, lltype, datamodel)
         return cgutils.alloca_once(self.builder, lltype, name=name, zfill=False)
-
-    def create_cpython_wrapper(self, release_gil: bool = False) -> None:
-        """Write what Python calls."""
-        if self.genlower:
-            super().create_cpython_wrapper(release_gil)
-        else:
-            add_wrapper(self, release_gil)
 
     def lower_expr(self, resty: Any, expr: Any) -> Any:
         """Spare arrays the search for code for fixed indices, of which there is none."""

@@ -31,8 +31,8 @@ from groma._kernels.shortcuts import TypeInference
 
 #: Steps of Numba's compiler, and what takes their place.
 OURS = {NumbaLowering: NativeLowering, NopythonTypeInference: TypeInference}
-#: How the names of wrappers begin, and those of addresses of objects.
-_WRAPPER, _ADDRESS = "_ZN7cpython", "numba.dynamic.globals"
+#: How the names of wrappers begin.
+_WRAPPER = "_ZN7cpython"
 #: How many functions are being compiled: one inside the other. Numba compiles in one thread at a time.
 _depth = 0
 
@@ -60,19 +60,6 @@ class _NoMachineCode:
 class _Library(JITCodeLibrary):
     """Code of a function that Python calls; the wrapper, which unpacks arguments, is not optimised."""
 
-    #: Whether addresses of objects, which hold for this process only, were written into it.
-    _has_addresses = False
-
-    def add_ir_module(self, ir_module: Any) -> None:
-        """Add code, and see whether there are addresses in it."""
-        self._has_addresses |= any(name.startswith(_ADDRESS) for name in ir_module.globals)
-        super().add_ir_module(ir_module)
-
-    def _finalize_dynamic_globals(self) -> None:
-        """Search all names for addresses, which takes a while, only where there can be some."""
-        if self._has_addresses or any(library.has_dynamic_globals for library in self._linking_libraries):
-            super()._finalize_dynamic_globals()
-
     def _optimize_functions(self, ll_module: Any) -> None:
         ll_module.data_layout = self._codegen._data_layout
         for function in ll_module.functions:
@@ -91,7 +78,8 @@ class _InnerLibrary(_Library):
 
     def _finalize_final_module(self) -> None:
         self._finalize_dynamic_globals()
-        self._finalized = True  # whether all symbols are there is asked where machine code is made
+        self._verify_declare_only_symbols()
+        self._finalized = True
 
     def serialize_using_object_code(self) -> Any:
         self._ensure_finalized()
