@@ -27,11 +27,10 @@ class Cluster:
     rows: IntArray
 
     @staticmethod
-    def of(images: IntArray, neighbors: list[IntArray], views: LineViews) -> Cluster:
-        """Return the cluster of some images."""
+    def of(images: IntArray, neighbors: list[IntArray], pointers: IntArray) -> Cluster:
+        """Return the cluster of some images; rows of image i are ``pointers[i] : pointers[i + 1]``."""
         known = np.unique(np.concatenate([images, *(neighbors[i] for i in images)]))
-        spans = (views.rows(int(i)) for i in known)
-        rows = np.concatenate([np.arange(span.start, span.stop) for span in spans])
+        rows = np.concatenate([np.arange(*pointers[i : i + 2].tolist()) for i in known])
         return Cluster(np.sort(images), known, rows)
 
     def views(self, views: LineViews) -> LineViews:
@@ -61,10 +60,11 @@ class Cluster:
 _OF_IMAGES = ("camera", "center", "inverse_depth")
 
 
-def clusters(neighbors: list[IntArray], count: int, views: LineViews) -> list[Cluster]:
+def clusters(neighbors: list[IntArray], count: int, pointers: IntArray) -> list[Cluster]:
     """Divide images into at most so many clusters of about equal size, of images that are near each other.
 
-    Images are ordered so that neighbours come close (reverse Cuthill-McKee), and the order is cut.
+    Images are ordered so that neighbours come close (reverse Cuthill-McKee), and the order is cut. Rows of
+    the segments of image i are ``pointers[i] : pointers[i + 1]``.
     """
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import reverse_cuthill_mckee
@@ -75,4 +75,4 @@ def clusters(neighbors: list[IntArray], count: int, views: LineViews) -> list[Cl
     both_ways = np.append(first, near), np.append(near, first)
     graph = csr_array((np.ones(2 * len(near), np.int8), both_ways), (number, number))
     order = np.asarray(reverse_cuthill_mckee(graph, symmetric_mode=True), np.int64)
-    return [Cluster.of(part, neighbors, views) for part in np.array_split(order, count) if len(part)]
+    return [Cluster.of(part, neighbors, pointers) for part in np.array_split(order, count) if len(part)]
