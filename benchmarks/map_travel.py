@@ -11,6 +11,7 @@ import pickle
 import tempfile
 from collections import defaultdict
 from concurrent.futures import Executor, Future
+from contextvars import Context
 from pathlib import Path
 
 from groma.execution import work_with
@@ -31,7 +32,7 @@ class Counting(Executor):
         """See :class:`concurrent.futures.Executor`."""
         there = pickle.dumps((function, args, kwargs), protocol=5)
         sent, given, named = pickle.loads(there)
-        found = sent(*given, **named)
+        found = Context().run(sent, *given, **named)  # as in another process, which has no workers of its own
         work = getattr(args[0], "func", args[0])
         for k, more in enumerate((1, len(there), len(pickle.dumps(found, protocol=5)))):
             self.counts[work.__name__.lstrip("_")][k] += more

@@ -21,13 +21,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar, overload
 
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_work
-from groma.mapping.lines.clusters import Cluster, clusters
+from groma.mapping.lines.clusters import Cluster, clusters, rows_of_images
 from groma.mapping.lines.collect import line_map_of
 from groma.mapping.lines.filtering.filters import NEARBY, Evidence, SegmentKinds, filtered, is_edge
 from groma.mapping.lines.filtering.texture import num_expected
@@ -41,11 +41,13 @@ from groma.mapping.lines.linking.merge import merge_agreeing
 from groma.mapping.lines.linking.tracks import Tracks
 from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.outcomes import Outcome
-from groma.mapping.lines.views import LineViews, build_views, views_of_rows
+from groma.mapping.lines.views import build_views, views_of_rows
 from groma.scene import Scene
 
 if TYPE_CHECKING:
     from groma.features.segments import Segments
+
+_Item = TypeVar("_Item")
 
 
 def map_lines_by_clusters(
@@ -63,21 +65,30 @@ def map_lines_by_clusters(
     pointers = np.concatenate([[0], np.cumsum([len(one) for one in segments])]).astype(np.int64)
     count = -(-scene.num_images // options.cluster_size)
     whole = _Whole(scene, segments, neighbors, options)
-    parts = [_Part.of(one, whole) for one in clusters(neighbors, count, pointers)]
-    asked = [(part, None if earlier is None else part.earlier(earlier)) for part in parts]
-    placed = map_work(_places_of, asked, partial(progress, "proposing lines"))
-    places, ratios = _of_all(parts, placed)
-    work = [(part, _known(part.cluster, places)) for part in parts]
-    found = map_work(_lines_of, work, partial(progress, "linking segments"))
+    without_points = replace(whole, scene=scene.keep(points=[]))  # places are all that they tell
+    cut = clusters(neighbors, count, pointers)
+    own_rows = [rows_of_images(one.images, pointers) for one in cut]
 
-    image_idx, num_images = np.repeat(np.arange(scene.num_images), np.diff(pointers)), scene.num_images
-    outcomes, length = np.empty(len(image_idx), np.int64), np.empty(len(image_idx))
-    home, known = np.empty(num_images, np.int64), np.zeros((len(parts), num_images), bool)
-    for k, (part, one) in enumerate(zip(parts, found, strict=True)):
-        home[part.cluster.images], known[k, part.cluster.known] = k, True
-        outcomes[part.own_rows], length[part.own_rows] = one.outcomes, one.length
+    def asked(k: int) -> tuple[_Part, EarlierMap | None]:
+        part = _Part.of(cut[k], whole)
+        return part, None if earlier is None else part.earlier(earlier)
+
+    placed = map_work(_places_of, _Made(asked, len(cut)), partial(progress, "proposing lines"))
+    places, ratios = _of_all(own_rows, placed)
+
+    def placed_part(k: int) -> tuple[_Part, Places]:
+        return _Part.of(cut[k], without_points), _known(cut[k], places)
+
+    found = map_work(_lines_of, _Made(placed_part, len(cut)), partial(progress, "linking segments"))
+    num_segments, num_images = int(pointers[-1]), scene.num_images
+    outcomes, length = np.empty(num_segments, np.int64), np.empty(num_segments)
+    home, known = np.empty(num_images, np.int64), np.zeros((len(cut), num_images), bool)
+    for k, (cluster, one) in enumerate(zip(cut, found, strict=True)):
+        home[cluster.images], known[k, cluster.known] = k, True
+        outcomes[own_rows[k]], length[own_rows[k]] = one.outcomes, one.length
     rows = np.unique(np.concatenate([one.rows for one in found]))
     views = views_of_rows(scene, segments, rows, options.min_length, options.noise)
+    image_idx = np.repeat(np.arange(num_images), np.diff(pointers))
     tracks = joined(found, Borders(home, known, image_idx), views, rows, options.min_images)
     outcomes[outcomes <= Outcome.RECOVERED] = Outcome.REPEATED  # those of no line in the end
     outcomes[rows] = tracks.outcomes()
@@ -85,6 +96,25 @@ def map_lines_by_clusters(
         tracks = tracks.keep(_is_edge(whole, tracks, rows, length, outcomes), Outcome.TEXTURE)
         outcomes[rows] = tracks.outcomes()
     return line_map_of(tracks, rows, pointers, outcomes, neighbors, places, ratios)
+
+
+class _Made(Sequence[_Item]):
+    """So many pieces of work, each made when it is its turn: all at once would be several copies of the scene."""
+
+    def __init__(self, make: Callable[[int], _Item], count: int) -> None:
+        self._make, self._count = make, count
+
+    def __len__(self) -> int:
+        return self._count
+
+    @overload
+    def __getitem__(self, index: int) -> _Item: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[_Item]: ...
+    def __getitem__(self, index: int | slice) -> _Item | list[_Item]:
+        if isinstance(index, slice):
+            return [self._make(k) for k in range(self._count)[index]]
+        return self._make(range(self._count)[index])
 
 
 def _is_edge(whole: _Whole, tracks: Tracks, rows: IntArray, length: FloatArray, outcomes: IntArray) -> BoolArray:
@@ -114,7 +144,7 @@ class _Part:
     """What a cluster is told, in its own numbers of images: so much is sent to another process."""
 
     cluster: Cluster
-    #: Cameras, and the points that they see, of the cluster's images and its ring; and their segments.
+    #: Cameras, and for places the points that they see, of the cluster's images and its ring; and their segments.
     scene: Scene
     segments: list[Segments]
     #: Of each of these images, those among them.
@@ -131,11 +161,6 @@ class _Part:
         segments, is_own = [whole.segments[i] for i in known], np.isin(known, cluster.images)
         return _Part(cluster, whole.scene.subset(known), segments, near, is_own, whole.options)
 
-    @property
-    def own_rows(self) -> IntArray:
-        """Rows of the segments of the cluster's own images among all."""
-        return self.cluster.rows[np.repeat(self.is_own, [len(one) for one in self.segments])]
-
     def earlier(self, whole: EarlierMap) -> EarlierMap:
         """Return what an earlier map says of the images and segments that the cluster knows."""
         known, rows, lines = self.cluster.known, self.cluster.rows, whole.lines
@@ -151,16 +176,12 @@ class _Part:
         )
         return EarlierMap(whole.scene.points_only().subset(known), part)
 
-    def views(self) -> LineViews:
-        """The table of the segments that the cluster knows."""
-        options = self.options
-        return build_views(self.scene, self.segments, options.min_length, options.noise, options.depth_margin)
-
 
 def _places_of(asked: tuple[_Part, EarlierMap | None]) -> tuple[Places, FloatArray]:
     """Places and changes of depth of the segments of the cluster's own images; supporters by their rows among all."""
     part, earlier = asked
-    options, views = part.options, part.views()
+    options = part.options
+    views = build_views(part.scene, part.segments, options.min_length, options.noise, options.depth_margin)
     none = np.zeros(0, np.int64)
     near = [row if own else none for row, own in zip(part.neighbors, part.is_own, strict=True)]
     known = None if earlier is None else earlier.known(part.scene, views, near, options.noise)
@@ -176,9 +197,9 @@ def _places_of(asked: tuple[_Part, EarlierMap | None]) -> tuple[Places, FloatArr
     return replace(mine, supporters=part.cluster.whole(mine.supporters).astype(np.int32)), ratios[own]
 
 
-def _of_all(parts: Sequence[_Part], placed: Sequence[tuple[Places, FloatArray]]) -> tuple[Places, FloatArray]:
+def _of_all(own_rows: Sequence[IntArray], placed: Sequence[tuple[Places, FloatArray]]) -> tuple[Places, FloatArray]:
     """Places and changes of depth of all segments."""
-    order = np.argsort(np.concatenate([part.own_rows for part in parts]))
+    order = np.argsort(np.concatenate(own_rows))
     columns = {name: np.concatenate([getattr(one, name) for one, _ in placed])[order] for name in Places.names()}
     return Places(**columns), np.concatenate([ratios for _, ratios in placed])[order]
 
@@ -199,7 +220,8 @@ def _known_rows(cluster: Cluster, rows: IntArray, count: int) -> IntArray:
 def _lines_of(asked: tuple[_Part, Places]) -> Found:
     """The lines of a cluster, which see a segment of its own images."""
     part, places = asked
-    options, views = part.options, part.views()
+    options, rows = part.options, np.arange(len(part.cluster.rows))
+    views = views_of_rows(part.scene, part.segments, rows, options.min_length, options.noise)
     own = part.is_own[views.image_idx]
     unmerged = grow(Tracks.none(views, places.rejection), places, part.neighbors, options, lambda done, total: None)
     evidence = Evidence(

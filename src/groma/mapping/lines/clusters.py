@@ -30,8 +30,7 @@ class Cluster:
     def of(images: IntArray, neighbors: list[IntArray], pointers: IntArray) -> Cluster:
         """Return the cluster of some images; rows of image i are ``pointers[i] : pointers[i + 1]``."""
         known = np.unique(np.concatenate([images, *(neighbors[i] for i in images)]))
-        rows = np.concatenate([np.arange(*pointers[i : i + 2].tolist()) for i in known])
-        return Cluster(np.sort(images), known, rows)
+        return Cluster(np.sort(images), known, rows_of_images(known, pointers))
 
     def views(self, views: LineViews) -> LineViews:
         """Return the part of the table that belongs to the cluster and its ring."""
@@ -54,6 +53,11 @@ class Cluster:
     def whole(self, rows: IntArray) -> IntArray:
         """Return rows of the part as those of the table; those below zero stay."""
         return np.where(rows >= 0, self.rows[rows], rows) if len(self.rows) else rows
+
+
+def rows_of_images(images: IntArray, pointers: IntArray) -> IntArray:
+    """Rows of the segments of some images; those of image i are ``pointers[i] : pointers[i + 1]``."""
+    return np.concatenate([np.zeros(0, np.int64), *(np.arange(*pointers[i : i + 2].tolist()) for i in images)])
 
 
 #: Columns of :class:`LineViews` with a row for each image.
