@@ -96,7 +96,7 @@ def test_sums_are_in_the_order_of_the_shares_whoever_ends_first():
                 sums.of(share)["a"][share] += values[share]
         for share in order:
             sums.end(share)
-        np.testing.assert_array_equal(sums.total["a"], expected)
+        np.testing.assert_array_equal(sums.total()["a"], expected)
 
 
 def test_one_thread_adds_to_one_copy():
@@ -109,7 +109,7 @@ def test_one_thread_adds_to_one_copy():
         places.add(id(own))
         sums.end(share)
     assert len(places) == 2
-    np.testing.assert_array_equal(sums.total["a"], 4.0)
+    np.testing.assert_array_equal(sums.total()["a"], 4.0)
 
 
 def test_what_was_added_before_an_error_is_forgotten():
@@ -121,4 +121,12 @@ def test_what_was_added_before_an_error_is_forgotten():
     for share in range(3):
         sums.of(share)["a"][:] += share
         sums.end(share)
-    np.testing.assert_array_equal(sums.total["a"], 3.0)
+    np.testing.assert_array_equal(sums.total()["a"], 3.0)
+
+
+def test_what_others_add_to_the_sums_is_cleared_too():
+    """Where nothing is eliminated, as in a graph of poses, the sums are all from elsewhere."""
+    sums = OrderedSums({"a": 2}, [{}])
+    sums.total()["a"] += 7.0
+    sums.clear()
+    np.testing.assert_array_equal(sums.total()["a"], 0.0)

@@ -152,7 +152,7 @@ class OrderedSums(Generic[K]):
     """
 
     def __init__(self, sizes: Mapping[K, int], spans: Sequence[Mapping[K, Spans]]) -> None:
-        self.total = {name: np.zeros(size) for name, size in sizes.items()}
+        self._total = {name: np.zeros(size) for name, size in sizes.items()}
         self._spans = spans
         self._free: list[dict[K, FloatArray]] = []
         self._lock = threading.Lock()
@@ -160,14 +160,14 @@ class OrderedSums(Generic[K]):
         self._begin()
 
     def _begin(self) -> None:
-        self._taken = {0: self.total}
+        self._taken = {0: self._total}
         self._ended = {share for share, spans in enumerate(self._spans) if not spans}
         self._next = 0
 
     def clear(self) -> None:
         """Set the sums to zero; what shares have added and not ended is forgotten."""
         if not self._is_zero:
-            for total in self.total.values():
+            for total in self._total.values():
                 total[:] = 0.0
         self._is_zero = True
         self._begin()
@@ -180,6 +180,11 @@ class OrderedSums(Generic[K]):
         self._is_zero = False
         return self._taken[share]
 
+    def total(self) -> dict[K, FloatArray]:
+        """Return the sums of the shares that have ended; the caller may add to them, until they are cleared."""
+        self._is_zero = False
+        return self._total
+
     def end(self, share: int) -> None:
         """Note that a share has added all it has."""
         with self._lock:
@@ -190,11 +195,11 @@ class OrderedSums(Generic[K]):
                 self._next += 1
 
     def _copy(self) -> dict[K, FloatArray]:
-        return {name: np.zeros(total.size) for name, total in self.total.items()}
+        return {name: np.zeros(total.size) for name, total in self._total.items()}
 
     def _add(self, spans: Mapping[K, Spans], copy: dict[K, FloatArray]) -> None:
         for name, filled in spans.items():
             for begin, end in filled:
-                self.total[name][begin:end] += copy[name][begin:end]
+                self._total[name][begin:end] += copy[name][begin:end]
                 copy[name][begin:end] = 0.0
         self._free.append(copy)

@@ -247,9 +247,8 @@ class ReducedSystem:
         layout = self.layout
         self.num_singular_landmarks = sum(self._singular)
         self.S: dict[tuple[int, int], FloatArray] = {}
-        for pair in layout.blocks:
+        for pair, S in self._sums.total().items():
             a, b = layout.kept[pair[0]].width, layout.kept[pair[1]].width
-            S = self._sums.total[pair]
             direct = layout.num_direct[pair] * a * b
             S[:direct] += self.equations.H[pair]
             S = S.reshape(-1, a, b)
