@@ -152,6 +152,9 @@ class FileSequence:
             what = "cannot be read" if raw is None else f"is {raw.shape[1]}x{raw.shape[0]}, not {width}x{height} grey"
             remarks.append(f"{path.name} {what}; the frame comes without.")
             return None
+        if raw.dtype == np.uint8:  # a picture of depths; distances in so few steps would be taken for exact
+            remarks.append(f"{path.name} has 8 bits, too few for distances (16 or floats); the frame comes without.")
+            return None
         depth = raw.astype(np.float32) * np.float32(1.0 / self.preparation.depth_scale)
         # 65535 stands for no value in some data; NaN in images of floats.
         bad = raw == 65535 if raw.dtype == np.uint16 else ~(np.isfinite(depth) & (depth > 0))
