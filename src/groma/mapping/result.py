@@ -212,7 +212,7 @@ def _problem_of(scene: Scene, told: AdjustOptions) -> Problem:
         refine_intrinsics=bool(told.refine_intrinsics),
     )
     problem, ended_with = assemble(scene, assembly).problem, last_loss(told)
-    return with_loss(problem, ended_with)
+    return with_loss(problem, ended_with, line_loss_factor=told.line_loss_factor)
 
 
 def last_loss(told: AdjustOptions) -> Loss:
