@@ -296,7 +296,7 @@ def map_segments(
     independent = math.sqrt(1.0 + weighted.line_end_correlation)
     scene = with_shared_noise(scene, weighted.point_sigma_px, weighted.line_sigma_px * independent)
     adjusted = stages.run(adjust_everything, scene, weighted)
-    return result_of(points, scene, adjusted, weighted, line_map, options.min_confidence)
+    return result_of(points, scene, adjusted, weighted, line_map, options.min_confidence, not options.refine_poses)
 
 
 # --------------------------------------------------------------------------------------------------------------- stages
