@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -15,12 +15,14 @@ from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.scene.table import Table, check_sigma, column, convert, rows_of
 
+#: How the standard deviations of relations are called, after the column that holds the relations.
+_SIGMA = "_sigma"
+
 
 @dataclass(frozen=True, eq=False)
-class PointObservations(Table):
+class PointObservations(Table, noun="observation"):
     """A point seen in an image. Pixel (0.5, 0.5) is the centre of the first pixel."""
 
-    noun: ClassVar[str] = "observation"
     #: (N,) the image.
     image_idx: IntArray = column(np.int64, refers="images")
     #: (N,) the point.
@@ -30,10 +32,7 @@ class PointObservations(Table):
     #: (N,) number of the 2D point within its image (COLMAP's ``point2D_idx``).
     keypoint_idx: IntArray = column(np.int64)
     #: (N,) standard deviation of a coordinate, relative to the usual one; 1 if left out.
-    sigma: FloatArray = column(np.float64, fill=1.0)
-
-    def _check(self) -> None:
-        check_sigma("PointObservations.sigma", self.sigma)
+    sigma: FloatArray = column(np.float64, fill=1.0, check=check_sigma)
 
     @classmethod
     def numbered(
@@ -58,10 +57,9 @@ class PointObservations(Table):
 
 
 @dataclass(frozen=True, eq=False)
-class Keypoints(Table):
+class Keypoints(Table, noun="keypoint"):
     """2D points that belong to no 3D point; carried along so that a model is written back whole."""
 
-    noun: ClassVar[str] = "keypoint"
     #: (N,) the image.
     image_idx: IntArray = column(np.int64, refers="images")
     #: (N, 2) place, pixels.
@@ -71,10 +69,9 @@ class Keypoints(Table):
 
 
 @dataclass(frozen=True, eq=False)
-class LineObservations(Table):
+class LineObservations(Table, noun="observation"):
     """A line seen in an image as a segment."""
 
-    noun: ClassVar[str] = "observation"
     #: (N,) the image.
     image_idx: IntArray = column(np.int64, refers="images")
     #: (N,) the line.
@@ -82,10 +79,7 @@ class LineObservations(Table):
     #: (N, 4) end points u1 v1 u2 v2 of the detected segment, pixels; no correspondence with the 3D end points.
     segment: FloatArray = column(np.float64, 4)
     #: (N,) standard deviation of an end point across the segment, relative to the usual one; 1 if left out.
-    sigma: FloatArray = column(np.float64, fill=1.0)
-
-    def _check(self) -> None:
-        check_sigma("LineObservations.sigma", self.sigma)
+    sigma: FloatArray = column(np.float64, fill=1.0, check=check_sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,23 +114,23 @@ class Relations:
     #: (R, 2) plane, direction: it contains the direction.
     plane_along_direction: IntArray = column(np.int64, 2, refers=("planes", "directions"), optional=True)
     #: (R,) standard deviations: distance from the plane, also of the ends of a line; angle; distance from the line.
-    point_on_plane_sigma: FloatArray = column(np.float64, fill=0.0, length=1, of="point_on_plane")
-    line_on_plane_sigma: FloatArray = column(np.float64, fill=0.0, length=1, of="line_on_plane")
-    line_along_direction_sigma: FloatArray = column(np.float64, fill=0.0, of="line_along_direction")
-    point_on_line_sigma: FloatArray = column(np.float64, fill=0.0, length=1, of="point_on_line")
-    lines_meeting_sigma: FloatArray = column(np.float64, fill=0.0, length=1, of="lines_meeting")
-    parallel_planes_sigma: FloatArray = column(np.float64, fill=0.0, of="parallel_planes")
-    perpendicular_planes_sigma: FloatArray = column(np.float64, fill=0.0, of="perpendicular_planes")
-    parallel_directions_sigma: FloatArray = column(np.float64, fill=0.0, of="parallel_directions")
-    perpendicular_directions_sigma: FloatArray = column(np.float64, fill=0.0, of="perpendicular_directions")
-    plane_across_direction_sigma: FloatArray = column(np.float64, fill=0.0, of="plane_across_direction")
-    plane_along_direction_sigma: FloatArray = column(np.float64, fill=0.0, of="plane_along_direction")
+    point_on_plane_sigma: FloatArray = column(np.float64, fill=0.0, length=1)
+    line_on_plane_sigma: FloatArray = column(np.float64, fill=0.0, length=1)
+    line_along_direction_sigma: FloatArray = column(np.float64, fill=0.0)
+    point_on_line_sigma: FloatArray = column(np.float64, fill=0.0, length=1)
+    lines_meeting_sigma: FloatArray = column(np.float64, fill=0.0, length=1)
+    parallel_planes_sigma: FloatArray = column(np.float64, fill=0.0)
+    perpendicular_planes_sigma: FloatArray = column(np.float64, fill=0.0)
+    parallel_directions_sigma: FloatArray = column(np.float64, fill=0.0)
+    perpendicular_directions_sigma: FloatArray = column(np.float64, fill=0.0)
+    plane_across_direction_sigma: FloatArray = column(np.float64, fill=0.0)
+    plane_along_direction_sigma: FloatArray = column(np.float64, fill=0.0)
 
     def __post_init__(self) -> None:
         for item in fields(self):
             value = convert(f"Relations.{item.name}", getattr(self, item.name), item)
-            if owner := item.metadata["of"]:
-                count = len(getattr(self, owner))
+            if item.name.endswith(_SIGMA):
+                count = len(getattr(self, item.name.removesuffix(_SIGMA)))
                 value = value if value.any() else np.zeros(count)  # none of its own is as if left out
                 if len(value) != count:
                     raise ShapeError(f"Relations.{item.name} must have one row for each of {count}; got {len(value)}.")
@@ -150,7 +144,7 @@ class Relations:
     @classmethod
     def kinds(cls) -> tuple[str, ...]:
         """Return the names of the columns that hold pairs."""
-        return tuple(item.name for item in fields(cls) if not item.metadata["of"])
+        return tuple(item.name for item in fields(cls) if not item.name.endswith(_SIGMA))
 
     def sigma(self, kind: str) -> FloatArray:
         """Return the standard deviations (R,) of one kind; 0 where the noise of the images tells them."""
