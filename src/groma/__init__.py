@@ -9,7 +9,6 @@ costs next to nothing. Sub-packages are reachable the same way: ``groma.geometry
 import zlib as _zlib  # noqa: F401  (before pycolmap, whose library hides Python's own deflate and breaks it)
 from importlib import import_module
 
-import groma._moved  # noqa: F401  (names the new place of modules that moved)
 from groma._version import __version__ as __version__
 
 TYPE_CHECKING = False  # as in typing, which takes longer to import than all the rest
@@ -83,103 +82,60 @@ if TYPE_CHECKING:
     from groma.tracking import Tracker, TrackOptions, TrackResult, track
     from groma.viz.report.page import write_report
 
-#: Where each public name lives, and after a colon its name there if that is another; with ``__all__`` and the imports
-#: above the only place to touch when one is added.
-_HOME = {
-    "AbsolutePose": "groma.localization.pose.absolute_pose",
-    "AdjustOptions": "groma.adjustment.adjust",
-    "AdjustResult": "groma.adjustment.report",
-    "Alignment": "groma.adjustment.survey.align",
-    "FileFormatError": "groma.errors",
-    "GromaError": "groma.errors",
-    "InputError": "groma.errors",
-    "LandmarkMatches": "groma.estimators.motion.matches",
-    "LineBearing": "groma.factors.observations.line_bearing",
-    "LineOnPlane": "groma.factors.relations.line_on_plane",
-    "LineReprojection": "groma.factors.observations.line_reprojection",
-    "LocalizeOptions": "groma.localization.localizer",
-    "LocalizedImage": "groma.localization.localizer",
-    "Localizer": "groma.localization.localizer",
-    "MapOptions": "groma.mapping.map",
-    "MapResult": "groma.mapping.result",
-    "Motion": "groma.estimators.motion.estimation",
-    "MotionOptions": "groma.estimators.motion.estimation",
-    "OutputError": "groma.errors",
-    "PlaneObservation": "groma.factors.observations.plane_observation",
-    "PointOnPlane": "groma.factors.relations.point_on_plane",
-    "PointReprojection": "groma.factors.observations.point_reprojection",
-    "PoseGraphOptions": "groma.adjustment.graphs.pose_graph",
-    "PoseGraphResult": "groma.adjustment.graphs.pose_graph",
-    "PoseOptions": "groma.localization.pose.absolute_pose",
-    "PosePrior": "groma.factors.priors.pose_prior",
-    "Problem": "groma.problem.problem",
-    "ProblemError": "groma.errors",
-    "QueryCamera": "groma.localization.pose.camera",
-    "Ref": "groma.factors.contract",
-    "Reliability": "groma.adjustment.survey.records",
-    "Scene": "groma.scene",
-    "ShapeError": "groma.errors",
-    "Similarity": "groma.scene",
-    "Solution": "groma.solver.solve",
-    "SolveReport": "groma.solver.report",
-    "SolverOptions": "groma.solver.options",
-    "Survey": "groma.adjustment.survey.given",
-    "SurveyedResult": "groma.mapping.surveyed",
-    "Termination": "groma.solver.termination",
-    "TrackOptions": "groma.tracking",
-    "TrackResult": "groma.tracking",
-    "Tracker": "groma.tracking",
-    "Variables": "groma.problem.variables",
-    "adjust": "groma.adjustment.adjust",
-    "adjust_parts": "groma.adjustment.parts",
-    "adjust_pose_graph": "groma.adjustment.graphs.pose_graph",
-    "adjust_surveyed": "groma.mapping.surveyed",
-    "align": "groma.adjustment.survey.align",
-    "contributions": "groma.adjustment.contributions",
-    "convert": "groma.io.convert",
-    "diagnose": "groma.adjustment.diagnosis:diagnose_scene",
-    "estimate_absolute_pose": "groma.localization.pose.absolute_pose",
-    "estimate_motion": "groma.estimators.motion.estimation",
-    "evaluate_lines": "groma.evaluation.lines",
-    "evaluate_planes": "groma.evaluation.planes",
-    "evaluate_poses": "groma.evaluation.poses",
-    "evaluate_trajectory": "groma.evaluation.trajectory:score_trajectory",
-    "factor": "groma.factors.user",
-    "loss": "groma.factors.losses",
-    "map_images": "groma.mapping.map",
-    "open_sequence": "groma.io.sequences",
-    "read_scene": "groma.io",
-    "read_trajectory": "groma.io",
-    "reliability": "groma.adjustment.survey.reliability",
-    "solve": "groma.solver.solve",
-    "track": "groma.tracking",
-    "uncertainty": "groma.adjustment.uncertainty",
-    "warm_up": "groma.compilation.warmup",
-    "write_covariances": "groma.adjustment.covariance_files",
-    "write_parts": "groma.adjustment.parts",
-    "write_report": "groma.viz.report.page",
-    "write_scene": "groma.io",
+#: Public names by the module that they live in, and the names of two there; with ``__all__`` and the imports above the
+#: only place to touch when one is added.
+_NAMES = {
+    "adjustment.adjust": "AdjustOptions adjust",
+    "adjustment.contributions": "contributions",
+    "adjustment.covariance_files": "write_covariances",
+    "adjustment.diagnosis": "diagnose",
+    "adjustment.graphs.pose_graph": "PoseGraphOptions PoseGraphResult adjust_pose_graph",
+    "adjustment.parts": "adjust_parts write_parts",
+    "adjustment.report": "AdjustResult",
+    "adjustment.survey.align": "Alignment align",
+    "adjustment.survey.given": "Survey",
+    "adjustment.survey.records": "Reliability",
+    "adjustment.survey.reliability": "reliability",
+    "adjustment.uncertainty": "uncertainty",
+    "compilation.warmup": "warm_up",
+    "errors": "FileFormatError GromaError InputError OutputError ProblemError ShapeError",
+    "estimators.motion.estimation": "Motion MotionOptions estimate_motion",
+    "estimators.motion.matches": "LandmarkMatches",
+    "evaluation.lines": "evaluate_lines",
+    "evaluation.planes": "evaluate_planes",
+    "evaluation.poses": "evaluate_poses",
+    "evaluation.trajectory": "evaluate_trajectory",
+    "factors.contract": "Ref",
+    "factors.losses": "loss",
+    "factors.observations.line_bearing": "LineBearing",
+    "factors.observations.line_reprojection": "LineReprojection",
+    "factors.observations.plane_observation": "PlaneObservation",
+    "factors.observations.point_reprojection": "PointReprojection",
+    "factors.priors.pose_prior": "PosePrior",
+    "factors.relations.line_on_plane": "LineOnPlane",
+    "factors.relations.point_on_plane": "PointOnPlane",
+    "factors.user": "factor",
+    "io": "read_scene read_trajectory write_scene",
+    "io.convert": "convert",
+    "io.sequences": "open_sequence",
+    "localization.localizer": "LocalizeOptions LocalizedImage Localizer",
+    "localization.pose.absolute_pose": "AbsolutePose PoseOptions estimate_absolute_pose",
+    "localization.pose.camera": "QueryCamera",
+    "mapping.map": "MapOptions map_images",
+    "mapping.result": "MapResult",
+    "mapping.surveyed": "SurveyedResult adjust_surveyed",
+    "problem.problem": "Problem",
+    "problem.variables": "Variables",
+    "scene": "Scene Similarity",
+    "solver.options": "SolverOptions",
+    "solver.report": "SolveReport",
+    "solver.solve": "Solution solve",
+    "solver.termination": "Termination",
+    "tracking": "TrackOptions TrackResult Tracker track",
+    "viz.report.page": "write_report",
 }
-_SUBPACKAGES = (
-    "adjustment",
-    "cameras",
-    "compilation",
-    "errors",
-    "estimators",
-    "evaluation",
-    "factors",
-    "features",
-    "geometry",
-    "io",
-    "localization",
-    "mapping",
-    "problem",
-    "scene",
-    "solver",
-    "testing",
-    "tracking",
-    "viz",
-)
+_HOME = {name: f"groma.{module}" for module, names in _NAMES.items() for name in names.split()}
+_RENAMED = {"diagnose": "diagnose_scene", "evaluate_trajectory": "score_trajectory"}
 
 __all__ = [
     "AbsolutePose",
@@ -274,12 +230,12 @@ __all__ = [
     "write_report",
     "write_scene",
 ]
+_SUBPACKAGES = set(__all__) - _HOME.keys()
 
 
 def __getattr__(name: str) -> object:
     if name in _HOME:
-        module, _, name_there = _HOME[name].partition(":")
-        value = getattr(import_module(module), name_there or name)
+        value = getattr(import_module(_HOME[name]), _RENAMED.get(name, name))
     elif name in _SUBPACKAGES:
         value = import_module(f"groma.{name}")
     else:

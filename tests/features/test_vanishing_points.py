@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from groma.cameras import model as camera_model
-from groma.errors import InputError, ShapeError
-from groma.features.vanishing_points import consistent_directions, find_vanishing_points, segment_normals
+from groma.errors import ShapeError
+from groma.features.vanishing_points import find_vanishing_points, segment_normals
 from groma.geometry import quaternion
 
 pytestmark = pytest.mark.kernels
@@ -78,23 +78,6 @@ def test_normals_are_as_uncertain_as_they_say():
     assert np.abs(sampled - factors[0] @ factors[0].T).max() < 0.08 * np.abs(sampled).max()
 
 
-def test_directions_agree_across_images():
-    rng = np.random.default_rng(3)
-    model, params = camera_model("PINHOLE"), CAMERAS["PINHOLE"]
-    poses = np.array([pose_at(turn) for turn in ([0.4, -0.5, 0.2], [0.1, 0.6, -0.3], [-0.5, 0.2, 0.9])])
-    pictures = [picture(rng, pose, model, params, np.eye(3), 25, 20, 0.3) for pose in poses]
-    images = [find_vanishing_points(segments, 0.3, model, params) for segments, _ in pictures]
-    found = consistent_directions(images, poses)
-    labels = np.concatenate([label for _, label in pictures])
-    assert len(found) == 3
-    assert np.arccos(np.clip(np.abs(found.vectors).max(axis=1), 0, 1)).max() < 3e-3
-    assert len(found.orthogonal) == 3
-    assert found.label.shape == labels.shape
-    owner = np.abs(found.vectors).argmax(axis=1)
-    both = (found.label >= 0) & (labels >= 0)
-    assert (owner[found.label[both]] == labels[both]).mean() > 0.9
-
-
 def test_degenerate_segments_take_no_part():
     model, params = camera_model("PINHOLE"), CAMERAS["PINHOLE"]
     segments = np.array([[100.0, 100, 100, 100], [10, 10, 60, 80]])
@@ -104,12 +87,9 @@ def test_degenerate_segments_take_no_part():
     assert len(found) == 0 and found.label.tolist() == [-1, -1]
     nothing = find_vanishing_points(np.zeros((0, 4)), 0.3, model, params)
     assert len(nothing) == 0
-    assert len(consistent_directions([nothing, found], np.array([pose_at([0, 0, 0.1])] * 2))) == 0
 
 
 def test_bad_input():
     model, params = camera_model("PINHOLE"), CAMERAS["PINHOLE"]
     with pytest.raises(ShapeError, match="sigma"):
         segment_normals(np.zeros((3, 4)), np.ones(2), model, params)
-    with pytest.raises(InputError, match="one row"):
-        consistent_directions([], np.zeros((2, 7)))

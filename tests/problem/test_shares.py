@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The work on a problem divided among threads: what each share has, and costs evaluated many chunks at once."""
+"""The work on a problem divided among threads: what each share has, sums in order, costs of many chunks."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from groma.factors.losses import Cauchy
 from groma.problem import parallel
 from groma.problem.lay_out import lay_out
 from groma.problem.linearization import NormalEquations, to_solver_order
-from groma.problem.parallel import Workers, shares_of
+from groma.problem.parallel import OrderedSums, Workers, shares_of
 from groma.scene import synthetic
 
 
@@ -80,3 +80,53 @@ def test_chunks_that_are_not_wanted_are_left_out(layout):
     others = equations.cost(inputs, wanted=lambda chunk: id(chunk) not in chosen)
     assert some > 0.0 and others > 0.0
     assert some + others == pytest.approx(equations.cost(inputs), rel=1e-12)
+
+
+def test_sums_are_in_the_order_of_the_shares_whoever_ends_first():
+    """Large terms that cancel tell the order: (1 + 1e16) - 1e16 is 0, 1 + (1e16 - 1e16) is 1."""
+    values = [1.0, 1e16, 0.0, -1e16, 0.25]
+    spans = [{"a": [(0, 1), (k, k + 1)]} if k != 2 else {} for k in range(5)]
+    expected = np.array([((1.0 + 1e16) - 1e16) + 0.25, 1e16, 0.0, -1e16, 0.25])
+    sums = OrderedSums({"a": 5}, spans)
+    for order in ([0, 1, 3, 4], [4, 3, 1, 0], [3, 0, 4, 1]):
+        sums.clear()
+        for share in order:
+            sums.of(share)["a"][0] += values[share]
+            if share:
+                sums.of(share)["a"][share] += values[share]
+        for share in order:
+            sums.end(share)
+        np.testing.assert_array_equal(sums.total()["a"], expected)
+
+
+def test_one_thread_adds_to_one_copy():
+    sums = OrderedSums({"a": 3}, [{"a": [(0, 3)]}] * 4)
+    places = set()
+    for share in range(4):
+        own = sums.of(share)["a"]
+        np.testing.assert_array_equal(own, 0.0)  # the first begins with a clean total, the others with a clean copy
+        own += 1.0
+        places.add(id(own))
+        sums.end(share)
+    assert len(places) == 2
+    np.testing.assert_array_equal(sums.total()["a"], 4.0)
+
+
+def test_what_was_added_before_an_error_is_forgotten():
+    sums = OrderedSums({"a": 2}, [{"a": [(0, 2)]}] * 3)
+    sums.of(1)["a"] += 7.0
+    sums.of(0)["a"] += 7.0
+    sums.end(0)  # the second share never ends
+    sums.clear()
+    for share in range(3):
+        sums.of(share)["a"][:] += share
+        sums.end(share)
+    np.testing.assert_array_equal(sums.total()["a"], 3.0)
+
+
+def test_what_others_add_to_the_sums_is_cleared_too():
+    """Where nothing is eliminated, as in a graph of poses, the sums are all from elsewhere."""
+    sums = OrderedSums({"a": 2}, [{}])
+    sums.total()["a"] += 7.0
+    sums.clear()
+    np.testing.assert_array_equal(sums.total()["a"], 0.0)

@@ -24,7 +24,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from groma._numba import kernel, loop
-from groma._typing import FloatArray, IntArray
+from groma._typing import Columns, FloatArray, Inputs, IntArray
 from groma.errors import InputError, ShapeError
 from groma.factors._record import set_rows
 from groma.factors._rolling import compose_rows, split_rows
@@ -255,9 +255,7 @@ class CameraFactor(Factor):
         """See :meth:`Factor.residuals`."""
         return self._evaluate_rows(inputs, begin, end, self._nothing_wanted, out[:, :, None])
 
-    def linearize(
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def linearize(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:
         """See :meth:`Factor.linearize`."""
         if self.motion is not None:
             return self._linearize_rows(inputs, begin, end, columns, record)
@@ -304,9 +302,7 @@ class CameraFactor(Factor):
         return (-1,) * sum(slot not in (EXTRINSICS, MOTION) for slot in self.slots)
 
     @abstractmethod
-    def evaluate(
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:
         """Write the records as :meth:`Factor.linearize` does, for poses of single cameras.
 
         ``inputs`` are cam_from_world (M, 12), its index (N,), and the other ambient arrays; ``columns`` belong to all

@@ -31,7 +31,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
-from groma._typing import FloatArray, IntArray
+from groma._typing import Columns, FloatArray, Inputs, IntArray
 from groma.errors import ProblemError, ShapeError
 from groma.factors.losses import Loss, Trivial
 from groma.geometry.manifold import Manifold
@@ -161,9 +161,7 @@ class Factor(ABC):
         return self.linearize(inputs, begin, end, (-1,) * len(self.references()), out[:, :, None])
 
     @abstractmethod
-    def linearize(
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def linearize(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:
         """Write the records of factors begin..end to ``record`` (end-begin, m, width); return how many are degenerate.
 
         ``columns[b]`` is the first column of the b-th reference, or -1 if it is not wanted. The last column takes the

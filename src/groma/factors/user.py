@@ -58,7 +58,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from groma._numba import kernel
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.errors import InputError, ShapeError
 from groma.factors._examples import indices, make_example
 from groma.factors._record import set_rows
@@ -123,9 +123,7 @@ class UserFactor(Factor):
         with np.errstate(all="ignore"):  # matters with NUMBA_DISABLE_JIT=1 only
             return self._loops.get()[0](*self._inputs(inputs), begin, end, out)
 
-    def linearize(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def linearize(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         with np.errstate(all="ignore"):
             return self._loops.get()[1](*self._inputs(inputs), begin, end, columns, record)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Vanishing points of an image's segments, and the directions that they agree on across images.
+r"""Vanishing points of an image's segments.
 
 A segment's end points become bearings :math:`f_1, f_2`, under any camera model, and the segment the plane with normal
 :math:`n = \mathrm{unit}(f_1 \times f_2)`. Its 3D line runs in this plane. A vanishing point is therefore a direction
@@ -11,24 +11,19 @@ Noise: with :math:`a_k = n^\top \delta f_k` the displacement of an end point out
 
 .. math:: \delta n = -a_1\, \frac{f_2 \times n}{\sin\theta} - a_2\, \frac{n \times f_1}{\sin\theta},
           \qquad \sin\theta = \lVert f_1 \times f_2\rVert .
-
-Directions need rotations only, so with posed images all segments of all images vote together: vanishing directions of
-single images are the candidates, turned to the world, and all segments that agree refine them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.cameras import CameraModel
-from groma.errors import InputError, ShapeError
-from groma.estimators.directions import DirectionOptions, DirectionSet, directions_from_normals
-from groma.geometry import quaternion
-from groma.geometry.algebra import apply, dot, norm, ratio, unit, vectors
+from groma.errors import ShapeError
+from groma.estimators.directions import DirectionOptions, directions_from_normals
+from groma.geometry.algebra import dot, norm, ratio, vectors
 
 #: Segments whose ends are closer than this have no normal, radians.
 _MIN_ANGLE = 1e-6
@@ -149,58 +144,3 @@ def find_vanishing_points(
         normals,
         factors,
     )
-
-
-def consistent_directions(
-    vanishing_points: Sequence[VanishingPoints],
-    cam_from_world: FloatArray,
-    options: DirectionOptions | None = None,
-    rotation_sigma: float = 0.0,
-) -> DirectionSet:
-    """Find the directions in the world that the vanishing points of several images agree on.
-
-    Parameters
-    ----------
-    vanishing_points : sequence of C VanishingPoints
-        One per image.
-    cam_from_world : (C, 7) float64
-        Poses [qx qy qz qw tx ty tz]; only their rotations take part.
-    options : DirectionOptions, optional
-        What counts as a direction; by default two images must support it.
-    rotation_sigma : float
-        Standard deviation of the images' rotations, radians; widens the tests.
-
-    Returns
-    -------
-    DirectionSet
-        World frame. ``label`` counts the segments of all images, one image after the other.
-
-    Raises
-    ------
-    InputError
-        If the numbers of images differ.
-    """
-    options = options or DirectionOptions(min_groups=2)
-    poses = vectors(cam_from_world, 7, "cam_from_world")
-    if poses.ndim != 2 or len(poses) != len(vanishing_points):
-        raise InputError(
-            f"cam_from_world must have one row for each of the {len(vanishing_points)} images; got shape {poses.shape}."
-        )
-    rotations = np.swapaxes(quaternion.to_matrix(poses[:, :4]), 1, 2)
-    count = [len(image.normals) for image in vanishing_points]
-    image_idx = np.repeat(np.arange(len(count)), count)
-    empty = np.zeros((0, 3)), np.zeros((0, 3, 2))
-    normals = np.concatenate([empty[0], *(image.normals for image in vanishing_points)])
-    factors = np.concatenate([empty[1], *(image.factors for image in vanishing_points)])
-    candidates = np.concatenate(
-        [empty[0], *(apply(turn, image.directions) for turn, image in zip(rotations, vanishing_points, strict=True))]
-    )
-    good = np.flatnonzero(dot(normals, normals) > 0.0)
-    turned = rotations[image_idx[good]]
-    widened = replace(options, parallel_sigma=float(np.hypot(options.parallel_sigma, rotation_sigma)))
-    found = directions_from_normals(
-        unit(apply(turned, normals[good])), turned @ factors[good], widened, image_idx[good], candidates
-    )
-    label = np.full(len(normals), -1)
-    label[good] = found.label
-    return replace(found, label=label)

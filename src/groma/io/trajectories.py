@@ -19,7 +19,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -38,10 +37,9 @@ Rows = Iterable[tuple[int, str]]
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory(Table):
+class Trajectory(Table, noun="pose"):
     """Poses over time. Note the direction: world_from_cam, as trajectory files hold it."""
 
-    noun: ClassVar[str] = "pose"
     #: (N,) seconds.
     timestamps: FloatArray = column(np.float64)
     #: (N, 7) pose [qx qy qz qw tx ty tz]; the translation is the camera centre.

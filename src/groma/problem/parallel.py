@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Threads that share the work of one solve. The compiled loops release the GIL; the threads sleep while they wait.
 
-The work is divided into *shares*, which depend on the problem alone: each has sums of its own, and these are added in
-the order of the shares. The result is therefore the same to the last digit for any number of threads.
+The work is divided into *shares*, which depend on the problem alone: each is summed by itself, and these sums are added
+in the order of the shares. The result is therefore the same to the last digit for any number of threads.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from queue import Empty, SimpleQueue
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -19,6 +20,10 @@ from groma._typing import FloatArray
 from groma.problem.layout import Chunk, Layout
 
 T = TypeVar("T")
+K = TypeVar("K", bound=Hashable)
+
+#: Parts of an array: (begin, end) of each.
+Spans = Sequence[tuple[int, int]]
 
 
 class Workers:
@@ -63,8 +68,8 @@ class Workers:
 #: Problems with fewer factors are one share: they are not worth a thread; nor is a share of less than half of it. Where
 #: nothing is summed but costs, because nothing stays in a reduced system, fewer are (cost: time only).
 FACTORS_FOR_THREADS, FACTORS_ALONE = 50_000, 10_000
-#: Most shares, and most bytes that their copies of the reduced system take for every factor, about twice what its
-#: measurement does, unless two copies take more: even one thread has them all (cost: memory).
+#: Most shares, and most bytes for every factor (about twice what its measurement takes) that copies of the reduced
+#: system would take if every share had one, as with many threads; two shares there are always (cost: memory).
 MAX_SHARES, MAX_BYTES = 16, 96
 #: Landmarks add to each block of a copy so many times on average, or clearing and adding the copies takes too long
 #: (cost: time alone).
@@ -116,21 +121,85 @@ def shares_of(layout: Layout) -> list[list[Chunk]]:
 _SUM_IN_THREADS = 200_000
 
 
-def sum_of(
-    parts: list[FloatArray], workers: Workers, spans: Sequence[Sequence[tuple[int, int]]] | None = None
-) -> FloatArray:
-    """Add the other arrays to the first one, and return that; ``spans`` say where each is not zero: (begin, end)."""
+def sum_of(parts: list[FloatArray], workers: Workers) -> FloatArray:
+    """Add the other arrays to the first one, and return that."""
     total = parts[0]
-    spans = [[(0, total.size)]] * len(parts) if spans is None else spans
     tasks = workers.count if total.size > _SUM_IN_THREADS else 1
     cuts = [total.size * i // tasks for i in range(tasks + 1)]
 
     def add(task: int) -> None:
-        for part, filled in zip(parts[1:], spans[1:], strict=True):
-            for begin, end in filled:
-                own = slice(max(begin, cuts[task]), max(min(end, cuts[task + 1]), cuts[task]))
-                total[own] += part[own]
+        for part in parts[1:]:
+            total[cuts[task] : cuts[task + 1]] += part[cuts[task] : cuts[task + 1]]
 
     if len(parts) > 1:
         workers.map(add, tasks)
     return total
+
+
+class OrderedSums(Generic[K]):
+    """Arrays by name that shares add to, summed in the order of the shares, whichever thread has which.
+
+    The first share adds to the total itself. Any other adds to a copy. That is added to the total as soon as all shares
+    before have ended, and is then free for another share. So one thread has one copy, and several hardly more than one
+    each: a copy waits only while an earlier share takes longer than a later one.
+
+    Parameters
+    ----------
+    sizes
+        Length of each array.
+    spans
+        Of each share, where in each array it may add: (begin, end). A share without any adds nothing.
+    """
+
+    def __init__(self, sizes: Mapping[K, int], spans: Sequence[Mapping[K, Spans]]) -> None:
+        self._total = {name: np.zeros(size) for name, size in sizes.items()}
+        self._spans = spans
+        self._free: list[dict[K, FloatArray]] = []
+        self._lock = threading.Lock()
+        self._is_zero = True
+        self._begin()
+
+    def _begin(self) -> None:
+        self._taken = {0: self._total}
+        self._ended = {share for share, spans in enumerate(self._spans) if not spans}
+        self._next = 0
+
+    def clear(self) -> None:
+        """Set the sums to zero; what shares have added and not ended is forgotten."""
+        if not self._is_zero:
+            for total in self._total.values():
+                total[:] = 0.0
+        self._is_zero = True
+        self._begin()
+
+    def of(self, share: int) -> dict[K, FloatArray]:
+        """Return the arrays that a share adds to until it ends."""
+        if share not in self._taken:
+            with self._lock:
+                self._taken[share] = self._free.pop() if self._free else self._copy()
+        self._is_zero = False
+        return self._taken[share]
+
+    def total(self) -> dict[K, FloatArray]:
+        """Return the sums of the shares that have ended; the caller may add to them, until they are cleared."""
+        self._is_zero = False
+        return self._total
+
+    def end(self, share: int) -> None:
+        """Note that a share has added all it has."""
+        with self._lock:
+            self._ended.add(share)
+            while self._next in self._ended:
+                if self._next and self._spans[self._next]:
+                    self._add(self._spans[self._next], self._taken.pop(self._next))
+                self._next += 1
+
+    def _copy(self) -> dict[K, FloatArray]:
+        return {name: np.zeros(total.size) for name, total in self._total.items()}
+
+    def _add(self, spans: Mapping[K, Spans], copy: dict[K, FloatArray]) -> None:
+        for name, filled in spans.items():
+            for begin, end in filled:
+                self._total[name][begin:end] += copy[name][begin:end]
+                copy[name][begin:end] = 0.0
+        self._free.append(copy)

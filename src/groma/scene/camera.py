@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -19,12 +18,11 @@ CAMERA, OTHER = 0, 1
 
 
 @dataclass(frozen=True, eq=False)
-class Cameras(Table):
+class Cameras(Table, noun="camera"):
     """Calibrations: model, parameters and image size. Several images may share one."""
 
-    noun: ClassVar[str] = "camera"
     #: (C,) identifiers.
-    ids: IntArray = column(np.int64)
+    ids: IntArray = column(np.int64, check=check_unique)
     #: (C,) names of camera models, see :func:`groma.cameras.models`.
     models: tuple[str, ...] = text_column()
     #: (C, K) parameters, K that of the longest model; the rest of a row is zero. Pixels and pure numbers.
@@ -35,7 +33,6 @@ class Cameras(Table):
     height: IntArray = column(np.int64)
 
     def _check(self) -> None:
-        check_unique("Cameras.ids", self.ids)
         for row, count in enumerate(self.num_params):
             if count > self.params.shape[1]:
                 raise ShapeError(
@@ -82,22 +79,17 @@ class Cameras(Table):
 
 
 @dataclass(frozen=True, eq=False)
-class Rigs(Table):
+class Rigs(Table, noun="rig"):
     """Bodies that carry sensors. A single camera is a rig with one sensor."""
 
-    noun: ClassVar[str] = "rig"
     #: (G,) identifiers.
-    ids: IntArray = column(np.int64)
-
-    def _check(self) -> None:
-        check_unique("Rigs.ids", self.ids)
+    ids: IntArray = column(np.int64, check=check_unique)
 
 
 @dataclass(frozen=True, eq=False)
-class Sensors(Table):
+class Sensors(Table, noun="sensor"):
     """What is mounted on the rigs; the reference sensor of a rig defines the rig's frame."""
 
-    noun: ClassVar[str] = "sensor"
     #: (S,) the rig it is mounted on.
     rig_idx: IntArray = column(np.int64, refers="rigs")
     #: (S,) ``CAMERA`` (0) or ``OTHER`` (1, for example an inertial unit; carried along, not used).

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -14,28 +13,23 @@ from groma.scene.table import Table, check_unique, column, text_column
 
 
 @dataclass(frozen=True, eq=False)
-class Frames(Table):
+class Frames(Table, noun="frame"):
     """Where each rig was: one row per moment."""
 
-    noun: ClassVar[str] = "frame"
     #: (F,) identifiers.
-    ids: IntArray = column(np.int64)
+    ids: IntArray = column(np.int64, check=check_unique)
     #: (F,) the rig.
     rig_idx: IntArray = column(np.int64, refers="rigs")
     #: (F, 7) pose [qx qy qz qw tx ty tz], unit quaternions, scene units.
     rig_from_world: FloatArray = column(np.float64, 7, world="poses")
 
-    def _check(self) -> None:
-        check_unique("Frames.ids", self.ids)
-
 
 @dataclass(frozen=True, eq=False)
-class Images(Table):
+class Images(Table, noun="image"):
     """Images: a frame seen by one of its sensors."""
 
-    noun: ClassVar[str] = "image"
     #: (N,) identifiers.
-    ids: IntArray = column(np.int64)
+    ids: IntArray = column(np.int64, check=check_unique)
     #: (N,) file names.
     names: tuple[str, ...] = text_column()
     #: (N,) the camera (calibration).
@@ -44,6 +38,3 @@ class Images(Table):
     frame_idx: IntArray = column(np.int64, refers="frames")
     #: (N,) the sensor.
     sensor_idx: IntArray = column(np.int64, refers="sensors")
-
-    def _check(self) -> None:
-        check_unique("Images.ids", self.ids)

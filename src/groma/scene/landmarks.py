@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -28,22 +28,23 @@ def check_unit(name: str, vectors: FloatArray) -> None:
         raise InputError(f"{name} must be unit vectors; row {row} is {vectors[row].tolist()}. Divide by the length.")
 
 
+def check_normals(name: str, planes: FloatArray) -> None:
+    """Raise when a plane (n, w) has no unit normal."""
+    check_unit(f"{name}[:, :3]", planes[:, :3])
+
+
 @dataclass(frozen=True, eq=False)
-class Points(Table):
+class Points(Table, noun="point"):
     """Points in the world."""
 
-    noun: ClassVar[str] = "point"
     #: (P,) identifiers.
-    ids: IntArray = column(np.int64)
+    ids: IntArray = column(np.int64, check=check_unique)
     #: (P, 3) coordinates, scene units.
     xyz: FloatArray = column(np.float64, 3, world="points")
     #: (P, 3) red, green, blue.
     color: npt.NDArray[np.uint8] = column(np.uint8, 3)
     #: (P,) mean reprojection error, pixels; -1 where unknown.
     error: FloatArray = column(np.float64)
-
-    def _check(self) -> None:
-        check_unique("Points.ids", self.ids)
 
     @classmethod
     def at(cls, xyz: npt.ArrayLike) -> Self:
@@ -54,12 +55,11 @@ class Points(Table):
 
 
 @dataclass(frozen=True, eq=False)
-class Lines(Table):
+class Lines(Table, noun="line"):
     """Infinite lines, each with the segment of it that was seen."""
 
-    noun: ClassVar[str] = "line"
     #: (L,) identifiers.
-    ids: IntArray = column(np.int64)
+    ids: IntArray = column(np.int64, check=check_unique)
     #: (L, 6) Plücker vectors (moment, direction), unit direction, moment = point x direction.
     plucker: FloatArray = column(np.float64, 6, world="lines")
     #: (L, 2, 3) end points of the segment, scene units.
@@ -68,7 +68,6 @@ class Lines(Table):
     confidence: FloatArray = column(np.float64, fill=-1.0)
 
     def _check(self) -> None:
-        check_unique("Lines.ids", self.ids)
         check_unit("Lines.plucker[:, 3:]", self.plucker[:, 3:])
         if len(self):
             moment, direction = self.plucker[:, :3], self.plucker[:, 3:]
@@ -132,30 +131,20 @@ class Lines(Table):
 
 
 @dataclass(frozen=True, eq=False)
-class Planes(Table):
+class Planes(Table, noun="plane"):
     """Infinite planes."""
 
-    noun: ClassVar[str] = "plane"
     #: (K,) identifiers.
-    ids: IntArray = column(np.int64)
+    ids: IntArray = column(np.int64, check=check_unique)
     #: (K, 4) unit normal n and offset w with n.X + w = 0.
-    hesse: FloatArray = column(np.float64, 4, world="planes")
-
-    def _check(self) -> None:
-        check_unique("Planes.ids", self.ids)
-        check_unit("Planes.hesse[:, :3]", self.hesse[:, :3])
+    hesse: FloatArray = column(np.float64, 4, world="planes", check=check_normals)
 
 
 @dataclass(frozen=True, eq=False)
-class Directions(Table):
+class Directions(Table, noun="direction"):
     """Directions that several lines share (vanishing points)."""
 
-    noun: ClassVar[str] = "direction"
     #: (D,) identifiers.
-    ids: IntArray = column(np.int64)
+    ids: IntArray = column(np.int64, check=check_unique)
     #: (D, 3) unit vectors; the sign has no meaning.
-    vectors: FloatArray = column(np.float64, 3, world="directions")
-
-    def _check(self) -> None:
-        check_unique("Directions.ids", self.ids)
-        check_unit("Directions.vectors", self.vectors)
+    vectors: FloatArray = column(np.float64, 3, world="directions", check=check_unit)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -33,11 +33,9 @@ MIN_SQUARED_SINE = MIN_SINE**2
 
 
 @dataclass(frozen=True, eq=False)
-class LineIntervals(Table):
+class LineIntervals(Table, noun="interval", optional=True):
     """Parts of lines that images support. A line without rows is supported from end to end."""
 
-    noun: ClassVar[str] = "interval"
-    optional: ClassVar[bool] = True
     #: (K,) the line.
     line_idx: IntArray = column(np.int64, refers="lines")
     #: (K,) where on its segment the interval begins and ends: 0 is the first end point, 1 the second.

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -18,28 +17,24 @@ ROWS, COLUMNS = 0, 1
 
 
 @dataclass(frozen=True, eq=False)
-class CameraMotions(Table):
+class CameraMotions(Table, noun="motion", optional=True):
     """Images that were read row by row, and the motion of the camera meanwhile: uniform, along its own axes.
 
     The pose of such an image is that of its middle row. Where the last row is read first, all numbers have the other
     sign; nothing else depends on the direction.
     """
 
-    noun: ClassVar[str] = "motion"
-    optional: ClassVar[bool] = True
     #: (N,) the image, each once; those that are not named were taken at once.
-    image_idx: IntArray = column(np.int64, refers="images")
+    image_idx: IntArray = column(np.int64, refers="images", check=check_unique)
     #: (N, 6) how far the camera moves while the whole image is read (scene units) and turns (rotation vector, radians),
     #: both in the axes that it has in the middle: estimated.
     motion: FloatArray = column(np.float64, 6, length=(1, 1, 1, 0, 0, 0))
     #: (N, 6) what is known of it beforehand, and its standard deviations.
     expected: FloatArray = column(np.float64, 6, length=(1, 1, 1, 0, 0, 0))
-    sigma: FloatArray = column(np.float64, 6, length=(1, 1, 1, 0, 0, 0))
+    sigma: FloatArray = column(np.float64, 6, length=(1, 1, 1, 0, 0, 0), check=check_sigma)
     #: (N,) :data:`ROWS` or :data:`COLUMNS`.
     axis: IntArray = column(np.int64, fill=ROWS)
 
     def _check(self) -> None:
-        check_unique("CameraMotions.image_idx", self.image_idx)
-        check_sigma("CameraMotions.sigma", self.sigma)
         if len(self) and not np.isin(self.axis, (ROWS, COLUMNS)).all():
             raise InputError(f"CameraMotions.axis must be 0 or 1; got {sorted(set(self.axis.tolist()))}.")

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -17,10 +17,9 @@ from groma.scene.table import Table, check_sigma, column, convert, rows_of
 
 
 @dataclass(frozen=True, eq=False)
-class PointObservations(Table):
+class PointObservations(Table, noun="observation"):
     """A point seen in an image. Pixel (0.5, 0.5) is the centre of the first pixel."""
 
-    noun: ClassVar[str] = "observation"
     #: (N,) the image.
     image_idx: IntArray = column(np.int64, refers="images")
     #: (N,) the point.
@@ -30,10 +29,7 @@ class PointObservations(Table):
     #: (N,) number of the 2D point within its image (COLMAP's ``point2D_idx``).
     keypoint_idx: IntArray = column(np.int64)
     #: (N,) standard deviation of a coordinate, relative to the usual one; 1 if left out.
-    sigma: FloatArray = column(np.float64, fill=1.0)
-
-    def _check(self) -> None:
-        check_sigma("PointObservations.sigma", self.sigma)
+    sigma: FloatArray = column(np.float64, fill=1.0, check=check_sigma)
 
     @classmethod
     def numbered(
@@ -58,10 +54,9 @@ class PointObservations(Table):
 
 
 @dataclass(frozen=True, eq=False)
-class Keypoints(Table):
+class Keypoints(Table, noun="keypoint"):
     """2D points that belong to no 3D point; carried along so that a model is written back whole."""
 
-    noun: ClassVar[str] = "keypoint"
     #: (N,) the image.
     image_idx: IntArray = column(np.int64, refers="images")
     #: (N, 2) place, pixels.
@@ -71,10 +66,9 @@ class Keypoints(Table):
 
 
 @dataclass(frozen=True, eq=False)
-class LineObservations(Table):
+class LineObservations(Table, noun="observation"):
     """A line seen in an image as a segment."""
 
-    noun: ClassVar[str] = "observation"
     #: (N,) the image.
     image_idx: IntArray = column(np.int64, refers="images")
     #: (N,) the line.
@@ -82,10 +76,7 @@ class LineObservations(Table):
     #: (N, 4) end points u1 v1 u2 v2 of the detected segment, pixels; no correspondence with the 3D end points.
     segment: FloatArray = column(np.float64, 4)
     #: (N,) standard deviation of an end point across the segment, relative to the usual one; 1 if left out.
-    sigma: FloatArray = column(np.float64, fill=1.0)
-
-    def _check(self) -> None:
-        check_sigma("LineObservations.sigma", self.sigma)
+    sigma: FloatArray = column(np.float64, fill=1.0, check=check_sigma)
 
 
 @dataclass(frozen=True, eq=False)

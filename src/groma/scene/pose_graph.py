@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -18,10 +18,9 @@ _STILL = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
-class GraphPoses(Table):
+class GraphPoses(Table, noun="pose"):
     """The nodes of a pose graph. Note the direction: world_from_body, as pose graphs are written."""
 
-    noun: ClassVar[str] = "pose"
     #: (N,) identifiers, each once.
     ids: IntArray = column(np.int64)
     #: (N, 7) pose [qx qy qz qw tx ty tz].
@@ -31,10 +30,9 @@ class GraphPoses(Table):
 
 
 @dataclass(frozen=True, eq=False)
-class Motions(Table):
+class Motions(Table, noun="motion"):
     """The edges of a pose graph: where the second body is, seen from the first."""
 
-    noun: ClassVar[str] = "motion"
     #: (E,) rows of the two poses.
     first_idx: IntArray = column(np.int64)
     second_idx: IntArray = column(np.int64)

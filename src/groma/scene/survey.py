@@ -11,14 +11,15 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, ClassVar, Self
+from functools import partial
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
-from groma.scene.landmarks import check_unit
+from groma.scene.landmarks import check_normals, check_unit
 from groma.scene.table import OBJECTS, Table, check_sigma, check_unique, column, text_column
 
 if TYPE_CHECKING:
@@ -40,6 +41,8 @@ class Kind(IntEnum):
 #: Kinds that have a place and can be eliminated beside each other, and kinds that have a direction.
 LOCATED = (Kind.IMAGE, Kind.CONTROL_POINT, Kind.LINE, Kind.PLANE)
 DIRECTED = (Kind.IMAGE, Kind.LINE, Kind.PLANE, Kind.DIRECTION)
+#: Powers of the unit of length in the covariance of a pose.
+_POSE_LENGTHS = ((2, 2, 2, 1, 1, 1),) * 3 + ((1, 1, 1, 0, 0, 0),) * 3
 
 
 def check_covariance(name: str, covariance: FloatArray) -> None:
@@ -59,48 +62,48 @@ def check_covariance(name: str, covariance: FloatArray) -> None:
         )
 
 
+def check_kinds(name: str, kinds: IntArray, allowed: tuple[int, ...]) -> None:
+    """Raise where a kind of object is not allowed."""
+    if len(kinds) and not (known := np.isin(kinds, allowed)).all():
+        row = int(np.argmin(known))
+        names = ", ".join(f"{int(kind)} ({OBJECTS[kind]})" for kind in allowed)
+        raise InputError(f"{name} must be one of {names}; row {row} is {kinds[row]}.")
+
+
 def diagonal_covariance(sigma: npt.ArrayLike) -> FloatArray:
     """Return the covariances (N, 3, 3) of coordinates with standard deviations (N, 3)."""
     return np.square(np.asarray(sigma, float))[:, :, None] * np.eye(3)
 
 
 @dataclass(frozen=True, eq=False)
-class CameraPositions(Table):
+class CameraPositions(Table, noun="position", optional=True):
     """Measured places of camera centres: GNSS, total stations, EXIF."""
 
-    noun: ClassVar[str] = "position"
-    optional: ClassVar[bool] = True
     #: (N,) the image.
     image_idx: IntArray = column(np.int64, refers="images")
     #: (N, 3) measured place, scene units.
     xyz: FloatArray = column(np.float64, 3, world="points", measured=True)
     #: (N, 3, 3) its covariance, scene units squared.
-    covariance: FloatArray = column(np.float64, 3, 3, world="covariances", measured=True)
+    covariance: FloatArray = column(np.float64, 3, 3, world="covariances", measured=True, check=check_covariance)
     #: (N,) whether the row is a gross error that takes no part.
     rejected: BoolArray = column(np.bool_, fill=False)
 
-    def _check(self) -> None:
-        check_covariance("CameraPositions.covariance", self.covariance)
-
 
 @dataclass(frozen=True, eq=False)
-class ControlPoints(Table):
+class ControlPoints(Table, noun="control point", optional=True):
     """Points with a name that were measured in images, most of them in the world, too."""
 
-    noun: ClassVar[str] = "control point"
-    optional: ClassVar[bool] = True
     #: (N,) name, each once.
     names: tuple[str, ...] = text_column()
     #: (N, 3) where the scene has the point: estimated.
     xyz: FloatArray = column(np.float64, 3, world="points")
     #: (N, 3) measured place and (N, 3, 3) its covariance, scene units; of points of unknown place any numbers.
     measured: FloatArray = column(np.float64, 3, world="points", measured=True)
-    covariance: FloatArray = column(np.float64, 3, 3, world="covariances", measured=True)
+    covariance: FloatArray = column(np.float64, 3, 3, world="covariances", measured=True, check=check_covariance)
     #: (N,) :data:`UNKNOWN`, :data:`CONTROL`, :data:`CHECK` or :data:`REJECTED`.
     role: IntArray = column(np.int64)
 
     def _check(self) -> None:
-        check_covariance("ControlPoints.covariance", self.covariance)
         check_unique("ControlPoints.names", np.unique(np.asarray(self.names, str), return_inverse=True)[1])
         if len(self) and not np.isin(self.role, (UNKNOWN, CONTROL, CHECK, REJECTED)).all():
             raise InputError(f"ControlPoints.role must be 0, 1, 2 or 3; got {sorted(set(self.role.tolist()))}.")
@@ -117,11 +120,9 @@ class ControlPoints(Table):
 
 
 @dataclass(frozen=True, eq=False)
-class Marks(Table):
+class Marks(Table, noun="mark", optional=True):
     """A control point measured in an image. Pixel (0.5, 0.5) is the centre of the first pixel."""
 
-    noun: ClassVar[str] = "mark"
-    optional: ClassVar[bool] = True
     #: (N,) the image.
     image_idx: IntArray = column(np.int64, refers="images")
     #: (N,) the control point.
@@ -129,35 +130,30 @@ class Marks(Table):
     #: (N, 2) measured place, pixels.
     pixel: FloatArray = column(np.float64, 2)
     #: (N,) standard deviation of a coordinate, pixels.
-    sigma: FloatArray = column(np.float64)
+    sigma: FloatArray = column(np.float64, check=check_sigma)
     #: (N,) whether the row is a gross error that takes no part.
     rejected: BoolArray = column(np.bool_, fill=False)
 
-    def _check(self) -> None:
-        check_sigma("Marks.sigma", self.sigma)
-
 
 @dataclass(frozen=True, eq=False)
-class Distances(Table):
+class Distances(Table, noun="distance", optional=True):
     """Measured distances between two objects each: scale bars, tapes, bases of stereo heads, heights above a floor.
 
     Objects are camera centres, control points, lines and planes. From a line or plane it is measured at the foot of a
     place; between skew lines where they are nearest.
     """
 
-    noun: ClassVar[str] = "distance"
-    optional: ClassVar[bool] = True
     #: (N,) kinds of the two objects (:class:`Kind`), not larger for the first, and which they are.
-    first_kind: IntArray = column(np.int64)
+    first_kind: IntArray = column(np.int64, check=partial(check_kinds, allowed=LOCATED))
     first_idx: IntArray = column(np.int64, kinds="first_kind")
-    second_kind: IntArray = column(np.int64)
+    second_kind: IntArray = column(np.int64, check=partial(check_kinds, allowed=LOCATED))
     second_idx: IntArray = column(np.int64, kinds="second_kind")
     #: (N, 3) of a line or plane that is the first: near where it is measured; else any place. It does not count where
     #: ``is_shortest``.
     anchor: FloatArray = column(np.float64, 3, world="points")
     #: (N,) distance and its standard deviation, scene units.
-    distance: FloatArray = column(np.float64, length=1, measured=True)
-    sigma: FloatArray = column(np.float64, length=1, measured=True)
+    distance: FloatArray = column(np.float64, length=1, measured=True, check=check_sigma)
+    sigma: FloatArray = column(np.float64, length=1, measured=True, check=check_sigma)
     #: (N,) whether the row is a gross error that takes no part.
     rejected: BoolArray = column(np.bool_, fill=False)
     #: (N,) of two lines: whether it is the shortest between them, wherever that is.
@@ -166,10 +162,6 @@ class Distances(Table):
     def _check(self) -> None:
         if (self.is_shortest & ((self.first_kind != Kind.LINE) | (self.second_kind != Kind.LINE))).any():
             raise InputError("Distances.is_shortest is of two lines; other kinds have a place. Set it to False.")
-        check_sigma("Distances.distance", self.distance)
-        check_sigma("Distances.sigma", self.sigma)
-        for side in ("first", "second"):
-            check_kinds(f"Distances.{side}_kind", getattr(self, f"{side}_kind"), LOCATED)
         if (wrong := self.first_kind > self.second_kind).any():
             raise InputError(f"Distances: row {int(np.argmax(wrong))} has its kinds in the wrong order. Exchange them.")
         same = (self.first_kind == self.second_kind) & (self.first_idx == self.second_idx)
@@ -189,87 +181,67 @@ class Distances(Table):
 
 
 @dataclass(frozen=True, eq=False)
-class KnownPlanes(Table):
+class KnownPlanes(Table, noun="known plane", optional=True):
     """Objects that are on planes with known coordinates: heights, levelled floors, walls in the frame of a building."""
 
-    noun: ClassVar[str] = "known plane"
-    optional: ClassVar[bool] = True
     #: (N,) kind of the object (:class:`Kind`), and which it is: camera centre, control point, line or plane.
-    kind: IntArray = column(np.int64)
+    kind: IntArray = column(np.int64, check=partial(check_kinds, allowed=LOCATED))
     idx: IntArray = column(np.int64, kinds="kind")
     #: (N, 3) of a line or plane: near the place that is on the plane, two of a line and three of a plane; else any.
     anchor: FloatArray = column(np.float64, 3, world="points")
     #: (N, 4) unit normal and offset, n.X + w = 0, scene units.
-    hesse: FloatArray = column(np.float64, 4, world="planes", measured=True)
+    hesse: FloatArray = column(np.float64, 4, world="planes", measured=True, check=check_normals)
     #: (N,) standard deviation of the distance from it, scene units.
-    sigma: FloatArray = column(np.float64, length=1, measured=True)
+    sigma: FloatArray = column(np.float64, length=1, measured=True, check=check_sigma)
     #: (N,) whether the row is a gross error that takes no part.
     rejected: BoolArray = column(np.bool_, fill=False)
 
-    def _check(self) -> None:
-        check_kinds("KnownPlanes.kind", self.kind, LOCATED)
-        check_unit("KnownPlanes.hesse[:, :3]", self.hesse[:, :3])
-        check_sigma("KnownPlanes.sigma", self.sigma)
-
 
 @dataclass(frozen=True, eq=False)
-class KnownDirections(Table):
+class KnownDirections(Table, noun="known direction", optional=True):
     """Directions known in the world: gravity in cameras, lines, planes and vanishing directions that are vertical."""
 
-    noun: ClassVar[str] = "known direction"
-    optional: ClassVar[bool] = True
     #: (N,) kind of the object (:class:`Kind`): image, line, plane (its normal) or direction; and which it is.
-    kind: IntArray = column(np.int64)
+    kind: IntArray = column(np.int64, check=partial(check_kinds, allowed=DIRECTED))
     idx: IntArray = column(np.int64, kinds="kind")
     #: (N, 3) unit vector in the world. That of landmarks has no sign.
-    vector: FloatArray = column(np.float64, 3, world="directions", measured=True)
+    vector: FloatArray = column(np.float64, 3, world="directions", measured=True, check=check_unit)
     #: (N, 3) of images: how the camera sees it, a unit vector (x right, y down, z forward); else as ``vector``.
-    in_camera: FloatArray = column(np.float64, 3)
+    in_camera: FloatArray = column(np.float64, 3, check=check_unit)
     #: (N,) standard deviation of a component, radians.
-    sigma: FloatArray = column(np.float64)
+    sigma: FloatArray = column(np.float64, check=check_sigma)
     #: (N,) whether the row is a gross error that takes no part.
     rejected: BoolArray = column(np.bool_, fill=False)
 
-    def _check(self) -> None:
-        check_kinds("KnownDirections.kind", self.kind, DIRECTED)
-        check_unit("KnownDirections.vector", self.vector)
-        check_unit("KnownDirections.in_camera", self.in_camera)
-        check_sigma("KnownDirections.sigma", self.sigma)
-
 
 @dataclass(frozen=True, eq=False)
-class CameraPoses(Table):
+class CameraPoses(Table, noun="pose", optional=True):
     """Measured poses of cameras with their covariance: RTK with an IMU, a motion capture system, another adjustment."""
 
-    noun: ClassVar[str] = "pose"
-    optional: ClassVar[bool] = True
     #: (N,) the image.
     image_idx: IntArray = column(np.int64, refers="images")
     #: (N, 7) pose [qx qy qz qw tx ty tz].
     cam_from_world: FloatArray = column(np.float64, 7, world="poses", measured=True)
     #: (N, 6, 6) covariance of the shift along and the turn about the axes of the camera, scene units and radians.
     covariance: FloatArray = column(
-        np.float64, 6, 6, length=((2, 2, 2, 1, 1, 1),) * 3 + ((1, 1, 1, 0, 0, 0),) * 3, measured=True
+        np.float64,
+        6,
+        6,
+        length=((2, 2, 2, 1, 1, 1),) * 3 + ((1, 1, 1, 0, 0, 0),) * 3,
+        measured=True,
+        check=check_covariance,
     )
     #: (N,) whether the row is a gross error that takes no part.
     rejected: BoolArray = column(np.bool_, fill=False)
 
-    def _check(self) -> None:
-        check_covariance("CameraPoses.covariance", self.covariance)
-
 
 @dataclass(frozen=True, eq=False)
-class Held(Table):
+class Held(Table, noun="held object", optional=True):
     """Objects that keep the place they have: the cameras and landmarks of an earlier adjustment, a datum."""
 
-    noun: ClassVar[str] = "held object"
-    optional: ClassVar[bool] = True
     #: (N,) kind of the object (:class:`Kind`), and which it is. Of an image its whole frame is held.
-    kind: IntArray = column(np.int64)
+    kind: IntArray = column(np.int64, check=partial(check_kinds, allowed=tuple(Kind)))
     idx: IntArray = column(np.int64, kinds="kind")
-
-    def _check(self) -> None:
-        check_kinds("Held.kind", self.kind, tuple(Kind))
 
 
 def accepted(scene: Scene) -> Scene:
@@ -305,11 +277,3 @@ def with_rejected(scene: Scene, rows: Collection[tuple[str, int]]) -> Scene:
     role = np.where(points.role == REJECTED, CONTROL, points.role)
     role[[row for name, row in rows if name == "control_points"]] = REJECTED
     return scene.replace(**tables, control_points=points.replace(role=role))
-
-
-def check_kinds(name: str, kinds: IntArray, allowed: tuple[int, ...]) -> None:
-    """Raise where a kind of object is not allowed."""
-    if len(kinds) and not (known := np.isin(kinds, allowed)).all():
-        row = int(np.argmin(known))
-        names = ", ".join(f"{int(kind)} ({OBJECTS[kind]})" for kind in allowed)
-        raise InputError(f"{name} must be one of {names}; row {row} is {kinds[row]}.")

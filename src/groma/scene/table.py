@@ -2,14 +2,14 @@
 """The common form of everything a scene holds: a frozen table of equally long columns.
 
 A table is a frozen dataclass whose fields are made by :func:`column`. A column knows its dtype and the shape of one
-row, which table its indices refer to, and how its numbers change when the world moves. So conversion, validation,
-selection of rows, renumbering, similarity transforms, comparison and storage are written once, here and in
-:mod:`groma.scene.scene`. Every column defaults to no rows.
+row, which table its indices refer to, what its numbers must be, and how they change when the world moves. So
+conversion, validation, selection of rows, renumbering, similarity transforms, comparison and storage are written
+once, here and in :mod:`groma.scene.scene`. Every column defaults to no rows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -40,6 +40,7 @@ def column(
     optional: bool = False,
     of: str = "",
     measured: bool = False,
+    check: Callable[[str, Any], None] | None = None,
 ) -> Any:
     """Declare a column of arrays.
 
@@ -67,11 +68,13 @@ def column(
         In :class:`~groma.scene.observations.Relations`: the column that this one has a row for each row of.
     measured : bool
         An instrument other than the cameras says so, in the world: it stays where the scene is moved to fit it.
+    check : callable, optional
+        Takes the name of the column and its numbers, and raises where they are not what they must be.
     """
     empty = tuple(0 if size is None else size for size in row)
     about = {"dtype": np.dtype(dtype), "row": row, "fill": fill, "optional": optional, "of": of}
     about |= {"refers": (refers,) if isinstance(refers, str) else refers, "world": world, "length": length}
-    about |= {"kinds": kinds, "measured": measured}
+    about |= {"kinds": kinds, "measured": measured, "check": check}
     return field(default_factory=lambda: np.zeros((0, *empty), dtype), metadata=about)
 
 
@@ -84,7 +87,7 @@ def text_column() -> Any:
 class Table:
     """Equally long columns; see the module."""
 
-    #: What one row is called in messages.
+    #: What one row is called in messages: ``class Marks(Table, noun="mark", optional=True)``.
     noun: ClassVar[str] = "row"
     #: Whether files may lack the whole table; it then has no rows.
     optional: ClassVar[bool] = False
@@ -104,13 +107,17 @@ class Table:
                     f"All columns of {type(self).__name__} must be equally long; {first} has {length} rows, "
                     f"{item.name} has {len(value)}. Pass one row per {self.noun} in both."
                 )
+        for item in columns_of(type(self)) if len(self) else ():
+            if (check := item.metadata.get("check")) is not None:
+                check(f"{type(self).__name__}.{item.name}", getattr(self, item.name))
         self._check()
 
     def _check(self) -> None:
         """Check what only this table knows."""
 
-    def __init_subclass__(cls, **arguments: Any) -> None:
+    def __init_subclass__(cls, noun: str = "", optional: bool = False, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
+        cls.noun, cls.optional = noun or cls.noun, optional or cls.optional
         cls.__repr__ = Table.__repr__  # type: ignore[method-assign] - not the dataclass's, which prints every number
 
     def __repr__(self) -> str:

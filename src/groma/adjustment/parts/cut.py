@@ -38,11 +38,6 @@ def parts_of(folder: str | os.PathLike[str]) -> tuple[Path, ...]:
     return tuple(sorted(Path(folder).glob(PART_NAMES)))
 
 
-def is_parts_folder(path: str | os.PathLike[str]) -> bool:
-    """Tell whether a path is a folder with parts in it."""
-    return Path(path).is_dir() and next(Path(path).glob(PART_NAMES), None) is not None
-
-
 def write_parts(
     scene: Scene, folder: str | os.PathLike[str], observations: int = PART_SIZE, force: bool = False
 ) -> tuple[Path, ...]:

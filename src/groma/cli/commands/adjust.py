@@ -79,9 +79,9 @@ def adjust(
         bool, _options.CAMERAS.option("Estimate where the cameras sit on their rig.", "--refine-rigs")
     ] = False,
     rolling_shutter: _options.RollingShutter = None,
-    points: Annotated[bool, _options.ADJUSTMENT.option("Use points.", "--points/--no-points")] = True,
-    lines: Annotated[bool, _options.ADJUSTMENT.option("Use lines.", "--lines/--no-lines")] = True,
-    planes: Annotated[bool, _options.ADJUSTMENT.option("Use planes.", "--planes/--no-planes")] = True,
+    points: Annotated[bool, _options.ADJUSTMENT.option("Use points.")] = True,
+    lines: Annotated[bool, _options.ADJUSTMENT.option("Use lines.")] = True,
+    planes: Annotated[bool, _options.ADJUSTMENT.option("Use planes.")] = True,
     max_iterations: Annotated[
         int | None,
         _options.ADJUSTMENT.option("Stop after N steps. Default: 50, for pose graphs 100.", min=0, metavar="N"),
@@ -151,10 +151,7 @@ def adjust(
         ),
     ] = 1.0,
     diagnosis: Annotated[
-        bool | None,
-        _options.RESULTS.option(
-            "Say what the data do not determine. Default: yes up to 300 images.", "--diagnosis/--no-diagnosis"
-        ),
+        bool | None, _options.RESULTS.option("Say what the data do not determine. Default: yes up to 300 images.")
     ] = None,
     keep: Annotated[
         Keep,
@@ -162,23 +159,7 @@ def adjust(
             "With a folder of parts: keep them in memory from one step to the next; auto: where they fit."
         ),
     ] = "auto",
-    positions: _measured.Positions = None,
-    position_sigma: _measured.PositionSigma = None,
-    control: _measured.Control = None,
-    control_sigma: _measured.ControlSigma = None,
-    mark_sigma: _measured.MarkSigma = 1.0,
-    check: _measured.Check = None,
-    distances: _measured.Distances = None,
-    distance_sigma: _measured.DistanceSigma = None,
-    directions: _measured.Directions = None,
-    direction_sigma: _measured.DirectionSigma = None,
-    known_planes: _measured.KnownPlanes = None,
-    plane_sigma: _measured.PlaneSigma = None,
-    poses: _measured.Poses = None,
-    pose_sigma: _measured.PoseSigma = None,
-    hold: _measured.Hold = None,
-    crs: _measured.Crs = None,
-    keep_suspects: _measured.KeepSuspects = False,
+    measured: _measured.Measured = _measured.NOTHING,
     protocol: Annotated[
         Path | None,
         _measured.PANEL.option(
@@ -206,7 +187,7 @@ def adjust(
 
     if linear_solver != "auto":
         _check_linear_solver(linear_solver)
-    measured = _measured.given(locals())
+    measured.validate()
     in_parts = has_company() or is_parts(source)
     if not in_parts:
         _output.check_outputs(force, output, page, covariance, protocol, json_target=console.json_target)

@@ -46,6 +46,7 @@ def align(
         positions=positions, position_sigma="1" if positions else None,
         control=control, control_sigma="1" if control else None, crs=crs,
     )  # fmt: skip
+    measured.validate()
     if (reference is None) == (not measured):
         raise InputError("Pass either a REFERENCE scene, or --positions or --control.")
     _output.check_outputs(force, output, json_target=console.json_target)

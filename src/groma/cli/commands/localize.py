@@ -55,7 +55,7 @@ def localize(
         str | None,
         _options.PLAIN.option("The parameters, if they are known; they are then kept.", metavar="F,CX,CY,..."),
     ] = None,
-    lines: Annotated[bool, _options.PLAIN.option("Use lines besides points.", "--lines/--no-lines")] = True,
+    lines: Annotated[bool, _options.PLAIN.option("Use lines besides points.")] = True,
     min_length: Annotated[
         float, _options.PLAIN.option("Shortest line segment, pixels.", min=5.0, metavar="PX")
     ] = _MIN_LENGTH,

@@ -112,9 +112,7 @@ def map_(
             "Leave out lines less probably right than this; 0 keeps all.", min=0.0, max=1.0, metavar="P"
         ),
     ] = 0.5,
-    planes: Annotated[
-        bool, _options.LANDMARKS.option("Look for planes and directions.", "--planes/--no-planes")
-    ] = True,
+    planes: Annotated[bool, _options.LANDMARKS.option("Look for planes and directions.")] = True,
     refine_poses: Annotated[
         bool, _options.ADJUSTMENT.option("Move the cameras too, or the landmarks alone.", "--refine-poses/--fix-poses")
     ] = True,
@@ -135,27 +133,9 @@ def map_(
         ),
     ] = False,
     diagnosis: Annotated[
-        bool | None,
-        _options.ADJUSTMENT.option(
-            "Say what the data do not determine. Default: yes up to 300 images.", "--diagnosis/--no-diagnosis"
-        ),
+        bool | None, _options.ADJUSTMENT.option("Say what the data do not determine. Default: yes up to 300 images.")
     ] = None,
-    positions: _measured.Positions = None,
-    position_sigma: _measured.PositionSigma = None,
-    control: _measured.Control = None,
-    control_sigma: _measured.ControlSigma = None,
-    mark_sigma: _measured.MarkSigma = 1.0,
-    check: _measured.Check = None,
-    distances: _measured.Distances = None,
-    distance_sigma: _measured.DistanceSigma = None,
-    directions: _measured.Directions = None,
-    direction_sigma: _measured.DirectionSigma = None,
-    known_planes: _measured.KnownPlanes = None,
-    plane_sigma: _measured.PlaneSigma = None,
-    pose_sigma: _measured.PoseSigma = None,
-    hold: _measured.Hold = None,
-    crs: _measured.Crs = None,
-    keep_suspects: _measured.KeepSuspects = False,
+    measured: _measured.Measured = _measured.NOTHING,
     depth: _depth.Depth = None,
     depth_scale: _depth.DepthScale = None,
     relative_depth: _depth.RelativeDepth = False,
@@ -175,7 +155,9 @@ def map_(
     from groma.cli.shared.input import camera_parameters, check_inputs, refuse_idle
 
     _output.check_outputs(force, output, json_target=console.json_target)
-    measured = _measured.given(locals() | {"poses": poses if _has_noise(poses, pose_sigma) else None})
+    measured.validate()
+    if not _has_noise(poses, measured.pose_sigma):
+        measured = replace(measured, poses=None)
     check_inputs(images, model, poses, rig, line_matches, truth, extend, map_images, depth, *measured.files)
     maps = _depth.depth_maps(depth, depth_scale, relative_depth, images)
     known = {"--model": model, "--poses": poses, "--rig": rig, "--camera-params": camera_params, "--depth": depth}
@@ -188,7 +170,7 @@ def map_(
         ("--line-matcher", line_matcher is not None and line_matches is not None, "without --line-matches"),
         ("--line-detector", line_detector != "lsd" and line_matches is not None, "without --line-matches"),
         ("--camera-params", model is not None and camera_params is not None, "on images without a model"),
-        ("--keep-suspects", keep_suspects and not measured, "on measurements (--positions, --control, ...)"),
+        ("--keep-suspects", measured.keep_suspects and not measured, "on measurements (--positions, --control, ...)"),
         ("--truth", truth is not None and not contributions, "with --contributions, which compares with it"),
     )
     from groma.cli.shared.diagnosis import try_diagnosis
@@ -216,7 +198,7 @@ def map_(
         rigs=() if any(given is not None for given in (model, poses, extend)) else _rigs(console, images, rig),
         refine_rigs=refine_rig,
         rolling_shutter=rolling_shutter,
-        keep_suspects=keep_suspects,
+        keep_suspects=measured.keep_suspects,
         threads=console.threads,
         seed=seed,
     )

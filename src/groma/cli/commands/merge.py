@@ -25,9 +25,7 @@ def merge(
         Path | None,
         _options.PLAIN.option("The photographs of B, where it does not tell.", "--images-b", metavar="FOLDER"),
     ] = None,
-    scale: Annotated[
-        bool, _options.PLAIN.option("B may have another scale; without, both have the same.", "--scale/--no-scale")
-    ] = True,
+    scale: Annotated[bool, _options.PLAIN.option("B may have another scale; without, both have the same.")] = True,
     force: _options.Force = False,
     seed: _options.Seed = 0,
 ) -> None:

@@ -54,13 +54,11 @@ def track(
             "rgbd, stereo or mono; told by the files otherwise.", choices=_complete.SEQUENCES, metavar="KIND"
         ),
     ] = None,
-    points: Annotated[bool, _options.LANDMARKS.option("Follow points.", "--points/--no-points")] = True,
-    lines: Annotated[bool, _options.LANDMARKS.option("Follow line segments.", "--lines/--no-lines")] = True,
+    points: Annotated[bool, _options.LANDMARKS.option("Follow points.")] = True,
+    lines: Annotated[bool, _options.LANDMARKS.option("Follow line segments.")] = True,
     line_detector: _options.LineDetector = "lsd",
-    planes: Annotated[
-        bool, _options.LANDMARKS.option("Find planes in depth images, or in points and lines.", "--planes/--no-planes")
-    ] = True,
-    loops: Annotated[bool, _options.PLAIN.option("Close loops.", "--loops/--no-loops")] = True,
+    planes: Annotated[bool, _options.LANDMARKS.option("Find planes in depth images, or in points and lines.")] = True,
+    loops: Annotated[bool, _options.PLAIN.option("Close loops.")] = True,
     max_frames: Annotated[
         int | None, _options.PLAIN.option("Stop after N frames. Default: all.", min=1, metavar="N")
     ] = None,

@@ -26,7 +26,7 @@ def view(
     live: Annotated[
         bool, _options.PLAIN.option("Follow groma track while it runs: INPUT is its OUT.", "--live")
     ] = False,
-    browser: Annotated[bool, _options.PLAIN.option("Open a browser.", "--browser/--no-browser")] = True,
+    browser: Annotated[bool, _options.PLAIN.option("Open a browser.")] = True,
     force: _options.Force = False,
 ) -> None:
     """Look at a scene in the browser: cameras, points, lines, planes. Click a line for its observations.

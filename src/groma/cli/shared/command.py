@@ -7,9 +7,10 @@ import functools
 import inspect
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, get_args, get_type_hints
 
 import typer
 from typer.core import TyperCommand
@@ -92,9 +93,22 @@ def console_of(
 
 
 def with_common_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command a console and the options of :func:`console_of`, and let the shell complete files it takes."""
+    """Give a command a console and the options of :func:`console_of`, and let the shell complete files it takes.
+
+    A parameter that is a dataclass stands for the options that its fields declare. An option that the command has
+    itself, too, is given to both.
+    """
     own, common = inspect.signature(command, eval_str=True), inspect.signature(console_of, eval_str=True).parameters
-    for parameter in own.parameters.values():
+    groups: dict[str, Any] = {
+        name: one.annotation for name, one in own.parameters.items() if is_dataclass(one.annotation)
+    }
+    listed = [
+        one
+        for name, parameter in own.parameters.items()
+        for one in (_declared(groups[name], own.parameters) if name in groups else [parameter])
+        if name != "console"
+    ]
+    for parameter in listed:
         kind, *infos = get_args(parameter.annotation) or (parameter.annotation,)
         if Path in (kind, *get_args(kind)) and infos and infos[0].autocompletion is None:
             infos[0].autocompletion = left_to_shell
@@ -102,13 +116,23 @@ def with_common_options(command: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(command)
     def prepared(**options: Any) -> None:
         console = console_of(**{name: options.pop(name) for name in common})
-        command(console=console, **options)
+        made = {name: kind(**{item.name: options[item.name] for item in fields(kind)}) for name, kind in groups.items()}
+        command(console=console, **{name: value for name, value in options.items() if name in own.parameters}, **made)
 
-    parameters = [parameter for name, parameter in own.parameters.items() if name != "console"] + [*common.values()]
-    parameters = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
+    parameters = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in (*listed, *common.values())]
     prepared.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
     prepared.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return prepared
+
+
+def _declared(group: type[Any], own: Mapping[str, inspect.Parameter]) -> list[inspect.Parameter]:
+    """Return the options that the fields of a dataclass declare, without those that the command has itself."""
+    kinds = get_type_hints(group, include_extras=True)
+    return [
+        inspect.Parameter(item.name, inspect.Parameter.KEYWORD_ONLY, default=item.default, annotation=kinds[item.name])
+        for item in fields(group)
+        if item.name not in own
+    ]
 
 
 def forbid_colours(wanted: bool) -> None:

@@ -21,17 +21,12 @@ Depth = Annotated[
     PANEL.option(
         "Depth maps of the photographs, of their names and sizes: 16-bit PNG (millimetres), .npy or .npz "
         "(metres); they give the map its unit of length.",
-        "--depth",
         metavar="FOLDER",
     ),
 ]
 DepthScale = Annotated[
     float | None,
-    PANEL.option(
-        "Numbers in depth maps per metre. Default: 1000 for whole numbers, 1 for fractions.",
-        "--depth-scale",
-        metavar="S",
-    ),
+    PANEL.option("Numbers in depth maps per metre. Default: 1000 for whole numbers, 1 for fractions.", metavar="S"),
 ]
 RelativeDepth = Annotated[
     bool,

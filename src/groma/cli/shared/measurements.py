@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -27,16 +27,7 @@ Positions = Annotated[
     PANEL.option(
         "Measured camera positions: name, coordinates, standard deviations (CSV, or geo.txt of OpenDroneMap),"
         " or exif for the GPS of the photographs. The scene is brought into their frame.",
-        "--positions",
         metavar="FILE",
-    ),
-]
-PositionSigma = Annotated[
-    str | None,
-    PANEL.option(
-        "Standard deviation of positions where the file states none; or horizontal, vertical.",
-        "--position-sigma",
-        metavar="S[,S[,S]]",
     ),
 ]
 Control = Annotated[
@@ -44,100 +35,13 @@ Control = Annotated[
     PANEL.option(
         "Control points with their marks in the images: gcp_list.txt of OpenDroneMap, or OpenSfM's "
         "ground_control_points.json.",
-        "--control",
         metavar="FILE",
-    ),
-]
-ControlSigma = Annotated[
-    str | None,
-    PANEL.option(
-        "Standard deviation of their coordinates; or horizontal, vertical.", "--control-sigma", metavar="S[,S[,S]]"
-    ),
-]
-MarkSigma = Annotated[
-    float, PANEL.option("Standard deviation of marks, pixels.", "--mark-sigma", metavar="PX", min=1e-3)
-]
-Check = Annotated[
-    str | None, PANEL.option("Control points that are kept back to check the result.", "--check", metavar="NAME,...")
-]
-Distances = Annotated[
-    Path | None,
-    PANEL.option(
-        "Measured distances: name, name, distance, standard deviation; between images, control points and "
-        "landmarks (line:5, plane:2, point:17).",
-        "--distances",
-        metavar="FILE",
-    ),
-]
-DistanceSigma = Annotated[
-    float | None,
-    PANEL.option("Standard deviation of distances where the file states none.", "--distance-sigma", metavar="S"),
-]
-Directions = Annotated[
-    Path | None,
-    PANEL.option(
-        "Known directions: photograph, where down is in the axes of its camera (x right, y down, z forward), "
-        "degrees; or line:5 vertical 0.5.",
-        "--directions",
-        metavar="FILE",
-    ),
-]
-DirectionSigma = Annotated[
-    float | None,
-    PANEL.option(
-        "Standard deviation of directions where the file states none, degrees.", "--direction-sigma", metavar="DEG"
-    ),
-]
-KnownPlanes = Annotated[
-    Path | None,
-    PANEL.option(
-        "What is on planes with known coordinates: p1 z 12.3 0.01, or plane:2 0 0 1 -12.3 0.01 (n.X + w = 0).",
-        "--known-planes",
-        metavar="FILE",
-    ),
-]
-PlaneSigma = Annotated[
-    float | None,
-    PANEL.option(
-        "Standard deviation of the distance from known planes where the file states none.", "--plane-sigma", metavar="S"
-    ),
-]
-Poses = Annotated[
-    Path | None,
-    PANEL.option(
-        "Measured poses: name x y z qx qy qz qw and standard deviations or a covariance; or any file of "
-        "poses, with --pose-sigma.",
-        "--poses",
-        metavar="FILE",
-    ),
-]
-PoseSigma = Annotated[
-    str | None,
-    PANEL.option(
-        "Standard deviations of poses where the file states none: of positions, and of orientations in degrees.",
-        "--pose-sigma",
-        metavar="S,DEG",
-    ),
-]
-Hold = Annotated[
-    str | None,
-    PANEL.option(
-        "Images (also old/*), control points and landmarks (line:5) that keep the place they have.",
-        "--hold",
-        metavar="NAME,...",
-    ),
-]
-KeepSuspects = Annotated[
-    bool,
-    PANEL.option(
-        "Leave in what the test for gross errors would take out; it is named all the same.", "--keep-suspects"
     ),
 ]
 Crs = Annotated[
     str | None,
     PANEL.option(
         "Frame of the result: enu (default for longitude and latitude), utm, or a code such as EPSG:25832.",
-        "--crs",
         metavar="NAME",
     ),
 ]
@@ -145,27 +49,89 @@ Crs = Annotated[
 
 @dataclass(frozen=True)
 class Measured:
-    """What the options of :data:`PANEL` were given."""
+    """The options of :data:`PANEL`, which a command takes as one parameter, and what they were given."""
 
-    positions: str | None = None
-    position_sigma: str | None = None
-    control: Path | None = None
-    control_sigma: str | None = None
-    mark_sigma: float = 1.0
-    check: str | None = None
-    distances: Path | None = None
-    distance_sigma: float | None = None
-    directions: Path | None = None
-    direction_sigma: float | None = None
-    known_planes: Path | None = None
-    plane_sigma: float | None = None
-    poses: Path | None = None
-    pose_sigma: str | None = None
-    hold: str | None = None
-    crs: str | None = None
-    keep_suspects: bool = False
+    positions: Positions = None
+    position_sigma: Annotated[
+        str | None,
+        PANEL.option(
+            "Standard deviation of positions where the file states none; or horizontal, vertical.", metavar="S[,S[,S]]"
+        ),
+    ] = None
+    control: Control = None
+    control_sigma: Annotated[
+        str | None,
+        PANEL.option("Standard deviation of their coordinates; or horizontal, vertical.", metavar="S[,S[,S]]"),
+    ] = None
+    mark_sigma: Annotated[float, PANEL.option("Standard deviation of marks, pixels.", metavar="PX", min=1e-3)] = 1.0
+    check: Annotated[
+        str | None, PANEL.option("Control points that are kept back to check the result.", metavar="NAME,...")
+    ] = None
+    distances: Annotated[
+        Path | None,
+        PANEL.option(
+            "Measured distances: name, name, distance, standard deviation; between images, control points and "
+            "landmarks (line:5, plane:2, point:17).",
+            metavar="FILE",
+        ),
+    ] = None
+    distance_sigma: Annotated[
+        float | None, PANEL.option("Standard deviation of distances where the file states none.", metavar="S")
+    ] = None
+    directions: Annotated[
+        Path | None,
+        PANEL.option(
+            "Known directions: photograph, where down is in the axes of its camera (x right, y down, z forward), "
+            "degrees; or line:5 vertical 0.5.",
+            metavar="FILE",
+        ),
+    ] = None
+    direction_sigma: Annotated[
+        float | None,
+        PANEL.option("Standard deviation of directions where the file states none, degrees.", metavar="DEG"),
+    ] = None
+    known_planes: Annotated[
+        Path | None,
+        PANEL.option(
+            "What is on planes with known coordinates: p1 z 12.3 0.01, or plane:2 0 0 1 -12.3 0.01 (n.X + w = 0).",
+            metavar="FILE",
+        ),
+    ] = None
+    plane_sigma: Annotated[
+        float | None,
+        PANEL.option("Standard deviation of the distance from known planes where the file states none.", metavar="S"),
+    ] = None
+    poses: Annotated[
+        Path | None,
+        PANEL.option(
+            "Measured poses: name x y z qx qy qz qw and standard deviations or a covariance; or any file of "
+            "poses, with --pose-sigma.",
+            metavar="FILE",
+        ),
+    ] = None
+    pose_sigma: Annotated[
+        str | None,
+        PANEL.option(
+            "Standard deviations of poses where the file states none: of positions, and of orientations in degrees.",
+            metavar="S,DEG",
+        ),
+    ] = None
+    hold: Annotated[
+        str | None,
+        PANEL.option(
+            "Images (also old/*), control points and landmarks (line:5) that keep the place they have.",
+            metavar="NAME,...",
+        ),
+    ] = None
+    crs: Crs = None
+    keep_suspects: Annotated[
+        bool,
+        PANEL.option(
+            "Leave in what the test for gross errors would take out; it is named all the same.", "--keep-suspects"
+        ),
+    ] = False
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         """Refuse options that nothing is given for."""
         needs = {
             "--position-sigma": (self.position_sigma, self.positions, "--positions"),
@@ -246,9 +212,8 @@ class Measured:
         return read_exif_positions(where, names())
 
 
-def given(options: Mapping[str, Any]) -> Measured:
-    """Return the measurements among the options of a command, whose names are those of the fields."""
-    return Measured(**{item.name: options[item.name] for item in fields(Measured)})
+#: Of a command that was given none.
+NOTHING = Measured()
 
 
 def _read(reader: Callable[[Path], Any], path: Path | None) -> Any:

@@ -13,7 +13,7 @@ from groma.cli.shared.command import GENERAL, PLAIN, Panel
 CAMERAS, LANDMARKS = Panel("Cameras and poses"), Panel("Points, lines and planes")
 ADJUSTMENT, RESULTS = Panel("Adjustment"), Panel("Results")
 
-Seed = Annotated[int, GENERAL.option("Seed of the random numbers.", "--seed", min=0, metavar="N")]
+Seed = Annotated[int, GENERAL.option("Seed of the random numbers.", min=0, metavar="N")]
 #: Of commands that draw no random numbers: accepted, so that a script can pass it to every command, and not shown.
 NoSeed = Annotated[int, typer.Option("--seed", min=0, hidden=True)]
 Force = Annotated[bool, PLAIN.option("Replace what is there.", "--force", "-f")]
@@ -25,15 +25,12 @@ Contributions = Annotated[
 ]
 Truth = Annotated[
     Path | None,
-    RESULTS.option(
-        "With --contributions: a scene to compare the camera poses with, by name.", "--truth", metavar="SCENE"
-    ),
+    RESULTS.option("With --contributions: a scene to compare the camera poses with, by name.", metavar="SCENE"),
 ]
 LineDetector = Annotated[
     str,
     LANDMARKS.option(
         "What finds line segments: lsd, onnx:FILE (a network like M-LSD), or a detector of an installed package.",
-        "--line-detector",
         choices=_complete.DETECTORS,
         metavar="NAME",
     ),
@@ -43,7 +40,6 @@ RollingShutter = Annotated[
     CAMERAS.option(
         "Images were read row by row (or column by column: photographs turned upright): estimate how the "
         "camera moved meanwhile.",
-        "--rolling-shutter",
         metavar="rows|columns",
     ),
 ]

@@ -23,12 +23,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from groma._numba import kernel, loop
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices, make_example, visible_scene
 from groma.factors._rig import (
     EXTRINSICS,
@@ -108,9 +108,7 @@ class LineBearing(CameraFactor):
 
     rows: ClassVar[int] = 2
 
-    def evaluate(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         bearings = (self.start_bearings, self.end_bearings)
         return _linearize_all(*inputs, self.line.index, *bearings, begin, end, *columns, record)
 

@@ -26,12 +26,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from groma._numba import kernel, loop
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.cameras.dispatch import pinhole_parameters, pinhole_parameters_jacobian
 from groma.factors._examples import indices
 from groma.factors._pixels import PixelFactor, load_row, pixel_example
@@ -147,9 +147,7 @@ class LineReprojection(PixelFactor):
     measured: ClassVar[tuple[tuple[str, int], ...]] = (("segments", 4),)
     rows: ClassVar[int] = 2
 
-    def evaluate(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         arguments = self.arguments(inputs, self.line, (None, None), self.segments)
         return linearize_pixels(*arguments, begin, end, *columns, record)
 

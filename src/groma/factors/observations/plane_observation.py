@@ -28,12 +28,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from groma._numba import kernel, loop
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices, make_example, visible_scene
 from groma.factors._record import put_block, put_residual
 from groma.factors._rig import EXTRINSICS, POSE, CameraFactor, normalize_rows
@@ -135,7 +135,6 @@ class PlaneInCamera(CameraFactor):
 
 
 @register("plane_observation")
-@dataclass(frozen=True, kw_only=True)
 class PlaneObservation(PlaneInCamera):
     """Planes measured in the camera; residual: two sines of angles of the normal, and the offset in scene units.
 
@@ -152,7 +151,5 @@ class PlaneObservation(PlaneInCamera):
         _basis_all(self.planes_in_cam, out)
         return out
 
-    def evaluate(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         return _linearize_all(*inputs, self.plane.index, self.planes_in_cam, begin, end, *columns, record)

@@ -31,13 +31,12 @@ The residual depends on the origin and the unit of length, gives little weight t
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from groma._numba import kernel, loop
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._record import SMALL_TURN, put_block, put_residual
 from groma.factors.contract import WORLD_FIXED, Invariance, register
 from groma.factors.observations.plane_observation import PlaneInCamera
@@ -138,7 +137,6 @@ def _linearize_all(poses, pose_index, planes, plane_index, measured, begin, end,
 
 # ------------------------------------------------------------------------------------------------------------- Public
 @register("plane_quaternion")
-@dataclass(frozen=True, kw_only=True)
 class PlaneQuaternion(PlaneInCamera):
     """Planes measured in the camera, compared as quaternions; residual: a rotation vector (radians).
 
@@ -148,7 +146,5 @@ class PlaneQuaternion(PlaneInCamera):
     num_normalized: ClassVar[int] = 4
     invariance: ClassVar[Invariance] = WORLD_FIXED  # the angle between 4-vectors depends on the world origin
 
-    def evaluate(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         return _linearize_all(*inputs, self.plane.index, self.planes_in_cam, begin, end, *columns, record)

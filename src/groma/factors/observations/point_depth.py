@@ -18,12 +18,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from groma._numba import loop
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices, make_example, visible_scene
 from groma.factors._rig import (
     EXTRINSICS,
@@ -72,9 +72,7 @@ class PointDepth(CameraFactor):
     measured: ClassVar[tuple[tuple[str, int], ...]] = (("depths", 0),)
     rows: ClassVar[int] = 1
 
-    def evaluate(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         return _linearize_all(*inputs, self.point.index, self.depths, begin, end, *columns, record)
 
     @classmethod

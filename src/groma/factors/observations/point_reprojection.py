@@ -25,7 +25,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from groma._numba import kernel, loop
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.cameras.dispatch import project, project_jacobian, wrap
 from groma.factors._examples import indices
 from groma.factors._pixels import PixelFactor, load_row, pixel_example, put_parameters
@@ -133,9 +133,7 @@ class PointReprojection(PixelFactor):
     def residuals(self, inputs: tuple[Any, ...], begin: int, end: int, out: FloatArray) -> int:  # noqa: D102
         return _residual_all(*self._arguments(inputs[1:]), begin, end, out)
 
-    def evaluate(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         return _linearize_all(*self._arguments(inputs), begin, end, *columns, record)
 
     @classmethod

@@ -22,12 +22,12 @@ Source: Plücker notes, eqs. (65) to (76), with the corrections listed in
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from groma._numba import kernel, loop
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.cameras.dispatch import pinhole_parameters, pinhole_parameters_jacobian
 from groma.factors._examples import indices
 from groma.factors._pixels import StereoFactor, load_row, pixel_example
@@ -111,9 +111,7 @@ class StereoLine(StereoFactor):
     measured: ClassVar[tuple[tuple[str, int], ...]] = (("segments", 8),)
     rows: ClassVar[int] = 4
 
-    def evaluate(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         arguments = self.arguments(inputs, self.line, self.segments, np.atleast_1d(self.baseline))
         return _linearize_all(*arguments, begin, end, *columns, record)
 

@@ -16,12 +16,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from groma._numba import kernel, loop
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.cameras.dispatch import pinhole_parameters, pinhole_parameters_jacobian
 from groma.factors._examples import indices
 from groma.factors._pixels import StereoFactor, load_row, pixel_example, put_parameters
@@ -109,9 +109,7 @@ class StereoPoint(StereoFactor):
     measured: ClassVar[tuple[tuple[str, int], ...]] = (("pixels", 3),)
     rows: ClassVar[int] = 3
 
-    def evaluate(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         arguments = self.arguments(inputs, self.point, self.pixels, np.atleast_1d(self.baseline))
         return _linearize_all(*arguments, begin, end, *columns, record)
 

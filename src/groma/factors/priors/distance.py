@@ -36,7 +36,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from groma._numba import loop
-from groma._typing import BoolArray, FloatArray
+from groma._typing import BoolArray, Columns, FloatArray, Inputs
 from groma.errors import ShapeError
 from groma.factors._examples import make_example, random_poses
 from groma.factors._record import set_rows
@@ -181,9 +181,7 @@ class Distance(Factor):
     def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:  # noqa: D102
         return tuple(np.ascontiguousarray(ambient) for ambient in ambients)
 
-    def linearize(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def linearize(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         (one, first), (two, second) = self.references()
         kinds = KINDS.index(one.kind), KINDS.index(two.kind)
         return _linearize_all(

@@ -24,7 +24,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from groma._numba import loop
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices, make_example, random_poses
 from groma.factors._record import set_rows
 from groma.factors._rig import EXTRINSICS, POSE, CameraFactor, normalize_rows
@@ -133,9 +133,7 @@ class CameraDirection(CameraFactor):
     def _bases(self) -> FloatArray:
         return bases_of(self.in_camera)
 
-    def evaluate(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         return _of_cameras(*inputs, self.in_world, self._bases, begin, end, *columns, record)
 
     @classmethod
@@ -176,9 +174,7 @@ class KnownDirection(Factor):
     def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:  # noqa: D102
         return (np.ascontiguousarray(ambients[0]),)
 
-    def linearize(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def linearize(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         ((slot, ref),) = self.references()
         layout = 3 if slot.kind == "line" else 0, FACTOR_COLUMNS[slot.kind]
         return _of_landmarks(inputs[0], ref.index, *layout, self._bases, begin, end, columns[0], record)

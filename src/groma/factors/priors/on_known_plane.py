@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from groma._numba import loop
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices, make_example, random_poses
 from groma.factors._record import set_rows
 from groma.factors._rig import normalize_rows
@@ -73,9 +73,7 @@ class OnKnownPlane(Factor):
     def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:  # noqa: D102
         return (np.ascontiguousarray(ambients[0]),)
 
-    def linearize(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def linearize(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         ((slot, ref),) = self.references()
         kind = KINDS.index(slot.kind)
         return _linearize_all(inputs[0], ref.index, kind, self.arm, self.known, begin, end, columns[0], record)

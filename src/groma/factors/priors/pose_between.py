@@ -22,7 +22,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from groma._numba import kernel, loop
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import make_example, random_poses
 from groma.factors._record import poses_from_states, put_residual, set_rows
 from groma.factors.contract import Example, Factor, Ref, Slot, register
@@ -108,9 +108,7 @@ class PoseBetween(Factor):
     def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:  # noqa: D102
         return *ambients, poses_from_states(self.first_from_second)
 
-    def linearize(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def linearize(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         (firsts, seconds, Z), (i, j) = inputs, columns
         return _linearize_all(firsts, seconds, Z, self.first.index, self.second.index, begin, end, i, j, record)
 

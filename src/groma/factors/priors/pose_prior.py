@@ -28,7 +28,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from groma._numba import kernel, loop
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices, make_example, random_poses
 from groma.factors._record import SMALL_TURN, poses_from_states, put_block, put_residual, set_rows
 from groma.factors.contract import WORLD_FIXED, Example, Factor, Invariance, Ref, Slot, register
@@ -183,9 +183,7 @@ class PosePrior(Factor):
         """The prior poses (N, 12) as matrices."""
         return poses_from_states(self.cam_from_world)
 
-    def linearize(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def linearize(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         poses, priors = inputs
         return _linearize_all(poses, priors, self.pose.index, begin, end, columns[0], record)
 

@@ -11,12 +11,12 @@ On a rig the centre is that of the camera, not of the body (:mod:`groma.factors.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from groma._numba import loop
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices, make_example
 from groma.factors._rig import EXTRINSICS, POSE, CameraFactor
 from groma.factors.contract import WORLD_FIXED, Example, Invariance, Ref, Slot, register
@@ -51,9 +51,7 @@ class PositionPrior(CameraFactor):
     invariance: ClassVar[Invariance] = WORLD_FIXED
     rows: ClassVar[int] = 3
 
-    def evaluate(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         return _linearize_all(*inputs, self.cam_center_in_world, begin, end, *columns, record)
 
     @classmethod

@@ -36,7 +36,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from groma._numba import kernel, loop
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import make_example, random_poses
 from groma.factors._record import put_residual, set_rows
 from groma.factors.contract import ANY_SIMILARITY, Example, Factor, Invariance, Ref, Slot, register
@@ -156,9 +156,7 @@ class SimilarityBetween(Factor):
     def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:  # noqa: D102
         return *ambients, sim3.inverse(self.first_from_second)
 
-    def linearize(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def linearize(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         return _linearize_all(*inputs, self.first.index, self.second.index, begin, end, columns, record)
 
     @classmethod

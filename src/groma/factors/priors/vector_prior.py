@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.errors import ShapeError
 from groma.factors._examples import indices, make_example
 from groma.factors.contract import WORLD_FIXED, Example, Factor, Invariance, Ref, Slot, register
@@ -58,9 +58,7 @@ class VectorPrior(Factor):
         np.subtract(inputs[0][self.variable.index[begin:end]], self.measured[begin:end], out=out)
         return 0
 
-    def linearize(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def linearize(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         self.residuals(inputs, begin, end, record[:, :, -1])
         if columns[0] >= 0:
             record[:, :, columns[0] : columns[0] + self.residual_size] = np.eye(self.residual_size)

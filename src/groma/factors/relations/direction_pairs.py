@@ -32,7 +32,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from groma._numba import kernel, loop
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices, make_example
 from groma.factors._record import put_residual
 from groma.factors.contract import ANY_SIMILARITY, Example, Factor, Invariance, Ref, Slot, register
@@ -111,15 +111,12 @@ def _linearize_all(variables, indices, layout, begin, end, columns, record):
 
 
 # ------------------------------------------------------------------------------------------------------------- Public
-@dataclass(frozen=True, kw_only=True)
 class DirectionPair(Factor):
     """Two variables that each have a direction: two slots of kind line, plane or direction."""
 
     invariance: ClassVar[Invariance] = ANY_SIMILARITY
 
-    def linearize(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def linearize(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         (_, first), (_, second) = self.references()
         kinds = [slot.kind for slot in self.slots]
         sizes, offsets = (tuple(table[kind] for kind in kinds) for table in (FACTOR_COLUMNS, DIRECTION_OFFSET))
@@ -140,13 +137,11 @@ class _Pair(DirectionPair):
     second: Ref
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Parallel(_Pair):
     rows: ClassVar[int] = 3
     independent_rows: ClassVar[int] = 2
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Orthogonal(_Pair):
     rows: ClassVar[int] = 1
 
@@ -167,7 +162,6 @@ class LineDirection(DirectionPair):
 
 
 @register("parallel_lines")
-@dataclass(frozen=True, kw_only=True)
 class ParallelLines(_Parallel):
     """Pairs of parallel lines. Degenerate for a line at infinity."""
 
@@ -175,7 +169,6 @@ class ParallelLines(_Parallel):
 
 
 @register("parallel_planes")
-@dataclass(frozen=True, kw_only=True)
 class ParallelPlanes(_Parallel):
     """Pairs of parallel planes. Degenerate for the plane at infinity."""
 
@@ -183,7 +176,6 @@ class ParallelPlanes(_Parallel):
 
 
 @register("line_perpendicular_to_plane")
-@dataclass(frozen=True, kw_only=True)
 class LinePerpendicularToPlane(_Parallel):
     """Lines perpendicular to planes: direction parallel to normal."""
 
@@ -191,7 +183,6 @@ class LinePerpendicularToPlane(_Parallel):
 
 
 @register("plane_perpendicular_to_direction")
-@dataclass(frozen=True, kw_only=True)
 class PlanePerpendicularToDirection(_Parallel):
     """Planes whose normal is a vanishing direction, a floor and the vertical for example."""
 
@@ -199,7 +190,6 @@ class PlanePerpendicularToDirection(_Parallel):
 
 
 @register("parallel_directions")
-@dataclass(frozen=True, kw_only=True)
 class ParallelDirections(_Parallel):
     """Pairs of equal vanishing directions, up to orientation."""
 
@@ -207,7 +197,6 @@ class ParallelDirections(_Parallel):
 
 
 @register("orthogonal_lines")
-@dataclass(frozen=True, kw_only=True)
 class OrthogonalLines(_Orthogonal):
     """Pairs of perpendicular lines, which need not meet. Degenerate for a line at infinity."""
 
@@ -215,7 +204,6 @@ class OrthogonalLines(_Orthogonal):
 
 
 @register("orthogonal_planes")
-@dataclass(frozen=True, kw_only=True)
 class OrthogonalPlanes(_Orthogonal):
     """Pairs of perpendicular planes. Degenerate for the plane at infinity."""
 
@@ -223,7 +211,6 @@ class OrthogonalPlanes(_Orthogonal):
 
 
 @register("line_parallel_to_plane")
-@dataclass(frozen=True, kw_only=True)
 class LineParallelToPlane(_Orthogonal):
     """Lines parallel to planes: direction perpendicular to normal."""
 
@@ -231,7 +218,6 @@ class LineParallelToPlane(_Orthogonal):
 
 
 @register("line_perpendicular_to_direction")
-@dataclass(frozen=True, kw_only=True)
 class LinePerpendicularToDirection(_Orthogonal):
     """Lines perpendicular to vanishing directions, level edges and the vertical for example."""
 
@@ -239,7 +225,6 @@ class LinePerpendicularToDirection(_Orthogonal):
 
 
 @register("plane_parallel_to_direction")
-@dataclass(frozen=True, kw_only=True)
 class PlaneParallelToDirection(_Orthogonal):
     """Planes that contain a vanishing direction, walls and the vertical for example."""
 
@@ -247,7 +232,6 @@ class PlaneParallelToDirection(_Orthogonal):
 
 
 @register("orthogonal_directions")
-@dataclass(frozen=True, kw_only=True)
 class OrthogonalDirections(_Orthogonal):
     """Pairs of perpendicular vanishing directions, the axes of a building for example."""
 

@@ -37,7 +37,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from groma._numba import kernel, loop
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices, make_example
 from groma.factors._record import put_block, put_residual, set_rows
 from groma.factors.contract import WORLD_FIXED, Example, Factor, Invariance, Ref, Slot, register
@@ -155,9 +155,7 @@ class LineOnPlane(_LineAndPlane):
         if self.anchor is not None:
             set_rows(self, "anchor", 3)
 
-    def linearize(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def linearize(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         anchors = np.zeros((len(self), 1, 3)) if self.anchor is None else self.anchor[:, None]
         return self._evaluate(True, anchors, inputs, begin, end, columns, record)
 
@@ -181,9 +179,7 @@ class SegmentOnPlane(_LineAndPlane):
     def __post_init__(self) -> None:
         set_rows(self, "ends", 2, 3)
 
-    def linearize(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def linearize(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         return self._evaluate(False, self.ends, inputs, begin, end, columns, record)
 
     @classmethod

@@ -13,11 +13,11 @@ and can be eliminated. The other half of the relation is :mod:`groma.factors.rel
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices
 from groma.factors._pixels import PixelFactor, pixel_example
 from groma.factors._rig import EXTRINSICS, POSE
@@ -44,9 +44,7 @@ class LineToPixel(PixelFactor):
     measured: ClassVar[tuple[tuple[str, int], ...]] = (("pixels", 2),)
     rows: ClassVar[int] = 1
 
-    def evaluate(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         arguments = self.arguments(inputs, self.line, (None,), self.pixels)
         return linearize_pixels(*arguments, begin, end, *columns, record)
 

@@ -19,12 +19,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from groma._numba import kernel, loop
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices, make_example
 from groma.factors._record import put_block, put_residual
 from groma.factors.contract import Example, Factor, Ref, Slot, register
@@ -85,9 +85,7 @@ class LinesMeeting(Factor):
     slots: ClassVar[tuple[Slot, ...]] = (Slot("first", "line"), Slot("second", "line"))
     rows: ClassVar[int] = 1
 
-    def linearize(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def linearize(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         (first, second), (i, j) = inputs, columns
         return _linearize_all(first, second, self.first.index, self.second.index, begin, end, i, j, record)
 

@@ -37,7 +37,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from groma._numba import kernel, loop
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.cameras.dispatch import project_jacobian, wrap
 from groma.factors._examples import indices
 from groma.factors._pixels import PixelFactor, load_row, pixel_example
@@ -248,9 +248,7 @@ class PointOnPlanePixels(_OnPlanePixels):
 
     rows: ClassVar[int] = 2
 
-    def evaluate(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         return self._evaluate(self.point, None, inputs, begin, end, columns, record)
 
     @classmethod
@@ -289,9 +287,7 @@ class SegmentOnPlanePixels(_OnPlanePixels):
 
     rows: ClassVar[int] = 4
 
-    def evaluate(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         return self._evaluate(self.line, self.ends, inputs, begin, end, columns, record)
 
     @classmethod

@@ -21,12 +21,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from groma._numba import kernel, loop
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices, make_example
 from groma.factors._record import put_block, put_residual
 from groma.factors.contract import Example, Factor, Ref, Slot, register
@@ -92,9 +92,7 @@ class PointOnLine(Factor):
     independent_rows: ClassVar[int] = 2
     is_incidence: ClassVar[bool] = True
 
-    def linearize(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def linearize(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         (points, lines), (i, j) = inputs, columns
         return _linearize_all(points, lines, self.point.index, self.line.index, begin, end, i, j, record)
 

@@ -15,12 +15,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from groma._numba import kernel, loop
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices, make_example
 from groma.factors._record import put_block, put_residual
 from groma.factors.contract import Example, Factor, Ref, Slot, register
@@ -70,9 +70,7 @@ class PointOnPlane(Factor):
     rows: ClassVar[int] = 1
     is_incidence: ClassVar[bool] = True
 
-    def linearize(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def linearize(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         (points, planes), (i, j) = inputs, columns
         return _linearize_all(points, planes, self.point.index, self.plane.index, begin, end, i, j, record)
 

@@ -20,12 +20,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from groma._numba import loop
-from groma._typing import FloatArray
+from groma._typing import Columns, FloatArray, Inputs
 from groma.cameras.dispatch import project_jacobian
 from groma.factors._examples import indices
 from groma.factors._pixels import PixelFactor, load_row, pixel_example
@@ -97,9 +97,7 @@ class PointToImageLine(PixelFactor):
 
     rows: ClassVar[int] = 1
 
-    def evaluate(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
+    def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         arguments = self.arguments(inputs, self.point, self.smallest_depth, self.image_lines)
         return _linearize_all(*arguments, begin, end, *columns, record)
 

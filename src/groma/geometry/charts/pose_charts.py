@@ -166,12 +166,14 @@ class PoseRight(_PoseChart):
     """Increments in the world frame, ``"right"``: T <- T Exp(xi)."""
 
     name: ClassVar[str] = "right"
+    #: Whether the translation moves along the twist, or by its first part as it is; to first order both are the same.
+    _full: ClassVar[bool] = True
 
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
-        """Move poses (N, 7) by right twists (N, 6)."""
+        """Move poses (N, 7) by right increments (N, 6)."""
         state, delta = as_steps(state, delta, 7, 6)
         out = np.empty_like(state)
-        _retract_right_all(state, delta, True, out)
+        _retract_right_all(state, delta, self._full, out)
         return out
 
     def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
@@ -184,26 +186,16 @@ class PoseRight(_PoseChart):
 
 
 @register_chart
-class PoseBody(_PoseChart):
+class PoseBody(PoseRight):
     """Increments in the world frame with a first-order translation, ``"body"``, as in the free line notes."""
 
     name: ClassVar[str] = "body"
-
-    def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
-        """Move poses (N, 7) by (dt, dphi) (N, 6)."""
-        state, delta = as_steps(state, delta, 7, 6)
-        out = np.empty_like(state)
-        _retract_right_all(state, delta, False, out)
-        return out
+    _full = False
 
     def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
         """Increments (dt, dphi) (N, 6) from ``state`` to ``other``, with rotations of at most pi."""
         relative = se3.compose(se3.inverse(state), other)
         return np.concatenate([relative[..., 4:], quaternion.log(relative[..., :4])], axis=-1)
-
-    def basis(self, state: FloatArray) -> FloatArray:
-        """Adjoint of the pose, (N, 6, 6): to first order the update is that of ``right``."""
-        return se3.adjoint(state)
 
 
 #: Charts of poses by name, the default first, registered ones too.

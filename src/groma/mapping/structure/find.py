@@ -108,8 +108,7 @@ def find_structure(
     options : StructureOptions, optional
         See there.
     candidates : (H, 3) float64, optional
-        Directions in the world to try for lines, such as those of
-        :func:`groma.features.vanishing_points.consistent_directions`.
+        Directions in the world to try for lines, such as vanishing points of images, turned to the world.
     progress : callable, optional
         Called with stage, number done, number in all.
 

@@ -14,8 +14,8 @@ are reduced to the kept blocks; some landmarks take a share of the damping, see 
           \delta_l = N (g_l + W \delta_c).
 
 Cost per landmark with n incidences: one inverse of size 3 or 4, n products ``N W`` and n(n+1)/2 block products that are
-added to S. The block products dominate; they run in explicit vectors (:mod:`groma._simd`). Each share of the
-work has its own copy of S, because two landmarks may touch the same block.
+added to S. The block products dominate; they run in explicit vectors (:mod:`groma._simd`). Two landmarks
+may touch the same block, so every thread adds to a copy of S (:class:`groma.problem.parallel.OrderedSums`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from groma._simd import add_matvec, add_product, set_product, width
 from groma._typing import FloatArray, IntArray
 from groma.problem.layout import Chunk, Eliminated, Layout
 from groma.problem.linearization import NormalEquations
-from groma.problem.parallel import sum_of
+from groma.problem.parallel import OrderedSums, Spans, sum_of
 
 #: Diagonal entries are damped as if they were at least this large, so that nothing is divided by zero. It is no
 #: tolerance: entries change with the square of the unit of length, and what the solver does must not.
@@ -177,16 +177,12 @@ class ReducedSystem:
         shares = len(equations.shares)
         self.N = [np.empty_like(V) for V in equations.V]
         self.h = [np.empty_like(g) for g in equations.g_landmarks]
-        self._S = [
-            {
-                pair: np.zeros(len(rows) * layout.kept[pair[0]].width * layout.kept[pair[1]].width)
-                for pair, (rows, _) in layout.blocks.items()
-            }
-            for _ in range(shares)
-        ]
-        # A copy is cleared and added where its share fills it: of a street that is a small part, and the rest of the
-        # copy never takes memory.
-        self._spans = [_spans(layout, share) for share in equations.shares]
+        sizes = {
+            pair: len(rows) * layout.kept[pair[0]].width * layout.kept[pair[1]].width
+            for pair, (rows, _) in layout.blocks.items()
+        }
+        self._sums = OrderedSums(sizes, [_spans(layout, share) for share in equations.shares])
+        self._last = [next((c for c in reversed(s) if c.eliminated is not None), None) for s in equations.shares]
         self._g = [[np.zeros(c.count * c.width) for c in layout.kept] for _ in range(shares)]
         widest = max([c.width for c in layout.kept], default=0)
         tallest = max([e.dof for e in layout.eliminated], default=0)
@@ -194,29 +190,20 @@ class ReducedSystem:
         kinds = [layout.problem.variables[e.group].manifold.kind for e in layout.eliminated]
         self._landmark_damping = [LANDMARK_DAMPING.get(kind, 1.0) for kind in kinds]
         self._singular = [0] * shares
-        self._new = True
         self.num_singular_landmarks = 0
         #: Of the last steps of the landmarks: the sums of delta D delta, with D as their damping takes it, and g delta.
         self.landmark_squares = self.landmark_slope = 0.0
 
     def clear(self) -> None:
         """Set all sums to zero."""
-        if self._new:
-            self._new = False
-            return
-        for S in self._S[0].values():
-            S[:] = 0.0  # the sum of all is formed there
-        for parts, spans in zip(self._S[1:], self._spans[1:], strict=True):
-            for pair, S in parts.items():
-                for begin, end in spans[pair]:
-                    S[begin:end] = 0.0
+        self._sums.clear()
         for gradients in self._g:
             for g in gradients:
                 g[:] = 0.0
-        self._singular = [0] * len(self._S)
+        self._singular = [0] * len(self._g)
 
     def eliminate_chunk(self, share: int, chunk: Chunk, damping: float) -> None:
-        """Eliminate the landmarks of one chunk into the share's copy of S.
+        """Eliminate the landmarks of one chunk of a share, whose chunks follow in their order.
 
         Where the equations are compact, this must follow the linearisation of the chunk: its W is there only then.
         """
@@ -224,7 +211,7 @@ class ReducedSystem:
         if e is None:
             return
         eliminated, equations = self.layout.eliminated[e], self.equations
-        dof, N, h = width(eliminated.dof), self.N[e], self.h[e]
+        dof, N, h, S = width(eliminated.dof), self.N[e], self.h[e], self._sums.of(share)
         own = np.array([damping * self._landmark_damping[e]])
         self._singular[share] += invert_blocks(
             equations.V[e], equations.g_landmarks[e], own, 0, chunk.begin, chunk.end, N, h, dof
@@ -233,15 +220,17 @@ class ReducedSystem:
             _eliminate(
                 incidences.pointer, incidences.block, *equations.blocks_of_chunk(share, chunk, c), N, h,
                 chunk.begin, chunk.end, incidences.pair_slots, incidences.pair_pointer, self._Y[share],
-                self._S[share][c, c], self._g[share][c], dof, width(self.layout.kept[c].width), _ONE,
+                S[c, c], self._g[share][c], dof, width(self.layout.kept[c].width), _ONE,
             )  # fmt: skip
         for (a, b), (slots, pointer) in eliminated.cross.items():
             _eliminate_cross(
                 eliminated.incidences[a].pointer, *equations.blocks_of_chunk(share, chunk, a),
                 eliminated.incidences[b].pointer, *equations.blocks_of_chunk(share, chunk, b),
-                N, chunk.begin, chunk.end, slots, pointer, self._Y[share], self._S[share][a, b],
+                N, chunk.begin, chunk.end, slots, pointer, self._Y[share], S[a, b],
                 dof, width(self.layout.kept[a].width), width(self.layout.kept[b].width),
             )  # fmt: skip
+        if chunk is self._last[share]:
+            self._sums.end(share)
 
     def eliminate(self, damping: float) -> None:
         """Eliminate all landmarks again, for another damping at the same linearisation; not where that is compact."""
@@ -254,14 +243,12 @@ class ReducedSystem:
         self.equations.workers.map(work, len(self.equations.shares))
 
     def assemble(self, damping: float) -> None:
-        """Sum the parts of all shares, add H and the damping: the blocks ``S`` and the right-hand side ``rhs``."""
+        """Add H and the damping to what landmarks left: the blocks ``S`` and the right-hand side ``rhs``."""
         layout = self.layout
         self.num_singular_landmarks = sum(self._singular)
         self.S: dict[tuple[int, int], FloatArray] = {}
-        for pair in layout.blocks:
+        for pair, S in self._sums.total().items():
             a, b = layout.kept[pair[0]].width, layout.kept[pair[1]].width
-            spans = [spans[pair] for spans in self._spans]
-            S = sum_of([parts[pair] for parts in self._S], self.equations.workers, spans)
             direct = layout.num_direct[pair] * a * b
             S[:direct] += self.equations.H[pair]
             S = S.reshape(-1, a, b)
@@ -324,11 +311,13 @@ class ReducedSystem:
         return deltas
 
 
-def _spans(layout: Layout, share: list[Chunk]) -> dict[tuple[int, int], list[tuple[int, int]]]:
-    """Return which numbers (begin, end) of each array of blocks the landmarks of a share add to.
+def _spans(layout: Layout, share: list[Chunk]) -> dict[tuple[int, int], Spans]:
+    """Return which numbers (begin, end) of each array of blocks the landmarks of a share add to, if it has any.
 
     Blocks that factors fill directly come first, the others in the order of the landmarks that fill them.
     """
+    if all(chunk.eliminated is None for chunk in share):
+        return {}
     spans = {}
     for pair, direct in layout.num_direct.items():
         begin, end = len(layout.blocks[pair][0]), direct
