@@ -7,7 +7,7 @@ from worlds import CAMERA, make_world, project
 
 from groma.factors.losses import Cauchy, GemanMcClure
 from groma.geometry import se3
-from groma.localization.mirror_image import closest_of
+from groma.localization.candidates import closest_of
 from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.focal_length import focal_step

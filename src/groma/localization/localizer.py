@@ -18,13 +18,12 @@ from groma.errors import InputError
 from groma.features.images import GrayImage, to_gray
 from groma.gates import gate
 from groma.io import read_scene
-from groma.localization.candidates import Candidates, described_alike, found_near
+from groma.localization.candidates import Candidates, MirrorImage, closest_of, described_alike, found_near
 from groma.localization.expected import FoundAgain, nearest_images, shown_of
 from groma.localization.features import DescribedImage, DescribedPoints, find_features
 from groma.localization.landmarks import DescribedLandmarks, coarsest, seen_in
 from groma.localization.map_images import OPTIONS, image_paths, images_in_summary
 from groma.localization.map_index import images_told, kept_index
-from groma.localization.mirror_image import MirrorImage, closest_of
 from groma.localization.pose.absolute_pose import (
     UNKNOWN_LENS,
     AbsolutePose,
