@@ -37,10 +37,11 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import tuned_numbers
 
+T = TypeVar("T")
 Found: TypeAlias = list[str]
 Function: TypeAlias = ast.FunctionDef | ast.AsyncFunctionDef
 LONG, MANY, RUN = 60, 10, 6
@@ -85,6 +86,11 @@ def docstring_lines(node: ast.AST) -> set[int]:
 
 def source_lines(module: Module, imports: bool = True) -> list[str]:
     """Return the lines that are neither blank, comment nor docstring."""
+    return list(source_rows(module, imports).values())
+
+
+def source_rows(module: Module, imports: bool = True) -> dict[int, str]:
+    """Return the lines that are neither blank, comment nor docstring, by number."""
     left_out: set[int] = set()
     for node in ast.walk(module.tree):
         if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
@@ -92,7 +98,7 @@ def source_lines(module: Module, imports: bool = True) -> list[str]:
         elif isinstance(node, (ast.Import, ast.ImportFrom)) and not imports:
             left_out |= set(range(node.lineno, (node.end_lineno or 0) + 1))
     lines = enumerate(map(str.strip, module.text.splitlines()), 1)
-    return [line for number, line in lines if line and not line.startswith("#") and number not in left_out]
+    return {number: line for number, line in lines if line and not line.startswith("#") and number not in left_out}
 
 
 def repeated_lines(modules: list[Module]) -> int:
@@ -269,11 +275,16 @@ def counts(root: Path) -> dict[str, int]:
 
 def counts_of(commit: str, root: Path) -> dict[str, int]:
     """Return the table of a commit of a checkout."""
+    return at_commit(commit, root, counts)
+
+
+def at_commit(commit: str, root: Path, count: Callable[[Path], T]) -> T:
+    """Return what is counted in a commit of a checkout."""
     command = ["git", "-C", str(root), "archive", commit, "src/groma"]
     packed = subprocess.run(command, capture_output=True, check=True).stdout
     with tempfile.TemporaryDirectory() as folder, tarfile.open(fileobj=io.BytesIO(packed)) as archive:
         archive.extractall(folder, filter="data")
-        return counts(Path(folder))
+        return count(Path(folder))
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Map the lines of posed images with groma and LIMAP, from the same segments and the same matches.
 
-    python benchmarks/lines.py [SCENE ...] [--data DIR] [--python-limap PYTHON] [--curves SVG]
+    python benchmarks/lines.py [SCENE ...] [--data DIR] [--python-limap PYTHON] [--curves SVG] [--cluster-size N]
 
 Without a Python that has pylimap 2 groma runs alone. Scenes whose data is not in the folder are left out.
 """
@@ -83,9 +83,9 @@ class Task:
         return "wide" if self.matches else "all"
 
 
-def prepare(source: LineScene, matching: str) -> Task:
+def prepare(source: LineScene, matching: str, cluster_size: int) -> Task:
     """Detect, choose neighbours, match."""
-    options = options_of(source.name)
+    options = replace(options_of(source.name), cluster_size=cluster_size)
     segments = source.segments(options.min_length)
     neighbors = covisible_neighbors(source.scene, options.num_neighbors, options.min_shared)
     matches = {}
@@ -324,6 +324,7 @@ def main() -> int:
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the data sets")
     parser.add_argument("--python-limap", help="Python that has pylimap 2; without it groma runs alone")
     parser.add_argument("--curves", type=Path, help="draw what is right over what is found, .svg")
+    parser.add_argument("--cluster-size", type=int, default=0, help="groma maps lines in clusters of so many images")
     parser.add_argument("--matching", choices=MATCHING, help="one kind of matches; default: both")
     arguments = parser.parse_args()
     if unknown := {*arguments.scenes} - {*SCENES}:
@@ -339,7 +340,7 @@ def main() -> int:
             continue
         rows = []
         for matching in [arguments.matching] if arguments.matching else MATCHING:
-            task = prepare(source, matching)
+            task = prepare(source, matching, arguments.cluster_size)
             found = run_groma(task)
             found += run_limap(task, arguments.python_limap) if arguments.python_limap else []
             rows += [row_of(task, lines) for lines in found]

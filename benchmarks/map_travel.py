@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """How much travels between processes that map together, by kind of work: megabytes there and back.
 
-    python benchmarks/map_travel.py IMAGES --model MODEL --workers 8
+    python benchmarks/map_travel.py IMAGES --model MODEL --workers 8 [--cluster-size 15]
 
 One process maps as ``mpiexec -n WORKERS groma map`` would divide the work; every piece is turned into bytes and back.
 """
@@ -11,10 +11,12 @@ import pickle
 import tempfile
 from collections import defaultdict
 from concurrent.futures import Executor, Future
+from contextvars import Context
 from pathlib import Path
 
 from groma.execution import work_with
 from groma.io import read_scene
+from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.map import MapOptions, map_images
 
 
@@ -30,7 +32,7 @@ class Counting(Executor):
         """See :class:`concurrent.futures.Executor`."""
         there = pickle.dumps((function, args, kwargs), protocol=5)
         sent, given, named = pickle.loads(there)
-        found = sent(*given, **named)
+        found = Context().run(sent, *given, **named)  # as in another process, which has no workers of its own
         work = getattr(args[0], "func", args[0])
         for k, more in enumerate((1, len(there), len(pickle.dumps(found, protocol=5)))):
             self.counts[work.__name__.lstrip("_")][k] += more
@@ -44,9 +46,11 @@ def main() -> None:
     parser.add_argument("images")
     parser.add_argument("--model", required=True)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--cluster-size", type=int, default=MapLinesOptions.cluster_size, help="images of a cluster")
     arguments = parser.parse_args()
+    options = MapOptions(threads=1, lines=MapLinesOptions(cluster_size=arguments.cluster_size))
     with tempfile.TemporaryDirectory() as folder, Counting(arguments.workers) as executor, work_with(executor):
-        map_images(arguments.images, Path(folder) / "work", read_scene(arguments.model), MapOptions(threads=1))
+        map_images(arguments.images, Path(folder) / "work", read_scene(arguments.model), options)
     print(f"{'work':20s} {'pieces':>7s} {'MB there':>9s} {'MB back':>9s}")
     rows = list(executor.counts.items())
     for name, (pieces, there, back) in [*rows, ("all", [sum(row[k] for _, row in rows) for k in range(3)])]:

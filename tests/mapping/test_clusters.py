@@ -26,7 +26,7 @@ def _shuffled_path(count, reach, seed=2):
 
 @pytest.mark.parametrize("count", [1, 3, 12, 40])
 def test_every_image_is_in_one_cluster(views, count):
-    found = clusters(_shuffled_path(12, 2), count, views)
+    found = clusters(_shuffled_path(12, 2), count, views.pointers)
     assert len(found) == min(count, 12)
     assert sorted(np.concatenate([one.images for one in found])) == list(range(12))
     assert max(len(one.images) for one in found) <= -(-12 // count)
@@ -35,14 +35,14 @@ def test_every_image_is_in_one_cluster(views, count):
 def test_a_ring_of_images_on_a_path_is_two_times_the_reach(views):
     """Whatever the order in which images come: they are put along the path first."""
     neighbors = _shuffled_path(12, 1)
-    for one in clusters(neighbors, 4, views):
+    for one in clusters(neighbors, 4, views.pointers):
         assert set(one.known) == {*one.images, *np.concatenate([neighbors[i] for i in one.images])}
         assert len(one.known) <= 3 + 2
 
 
 def test_the_part_of_a_cluster_is_that_of_the_table(views):
     neighbors = _shuffled_path(12, 2)
-    for one in clusters(neighbors, 3, views):
+    for one in clusters(neighbors, 3, views.pointers):
         part = one.views(views)
         assert len(part.image_idx) == np.diff(views.pointers)[one.known].sum()
         np.testing.assert_array_equal(one.known[part.image_idx], views.image_idx[one.rows])
@@ -58,4 +58,4 @@ def test_the_part_of_a_cluster_is_that_of_the_table(views):
 
 def test_images_without_neighbours_are_clusters_of_their_own(views):
     alone = [np.zeros(0, np.int64)] * 12
-    assert all(np.array_equal(one.known, one.images) for one in clusters(alone, 12, views))
+    assert all(np.array_equal(one.known, one.images) for one in clusters(alone, 12, views.pointers))

@@ -3,6 +3,7 @@
 import sys
 
 import numpy as np
+import pytest
 from _mpi import mpiexec, needs_mpi
 
 import groma
@@ -10,9 +11,11 @@ from groma.cli.main import run
 
 
 @needs_mpi
-def test_ranks_map_what_one_process_maps(corner, tmp_path):
+@pytest.mark.parametrize("cluster_size", ["0", "2"])
+def test_ranks_map_what_one_process_maps(corner, tmp_path, cluster_size):
     folder = corner[0]
     arguments = ["map", str(folder), "--model", str(folder.parent / "model.npz"), "--no-diagnosis", "--threads", "1"]
+    arguments += ["--cluster-size", cluster_size]
     assert run([*arguments, "-o", str(tmp_path / "one"), "-q"]) == 0
     said = mpiexec(*[["-m", "groma", *arguments, "-o", tmp_path / "two"]] * 2)
     assert said.returncode == 0, said.stderr

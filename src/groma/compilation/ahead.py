@@ -10,6 +10,7 @@ waits for the process that is at it. The processes end with the command.
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
@@ -135,6 +136,7 @@ def main(work: str, count: int) -> None:
     forked: list[int] = []
     if count > 1:
         make_ready(work)
+        gc.freeze()  # what is there stays: it need not be looked at again, nor copied after a fork
     while len(forked) + 1 < count:
         process = os.fork()
         if process == 0:

@@ -15,6 +15,9 @@ from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.scene.table import Table, check_sigma, column, convert, rows_of
 
+#: How the standard deviations of relations are called, after the column that holds the relations.
+_SIGMA = "_sigma"
+
 
 @dataclass(frozen=True, eq=False)
 class PointObservations(Table, noun="observation"):
@@ -111,23 +114,23 @@ class Relations:
     #: (R, 2) plane, direction: it contains the direction.
     plane_along_direction: IntArray = column(np.int64, 2, refers=("planes", "directions"), optional=True)
     #: (R,) standard deviations: distance from the plane, also of the ends of a line; angle; distance from the line.
-    point_on_plane_sigma: FloatArray = column(np.float64, fill=0.0, length=1, of="point_on_plane")
-    line_on_plane_sigma: FloatArray = column(np.float64, fill=0.0, length=1, of="line_on_plane")
-    line_along_direction_sigma: FloatArray = column(np.float64, fill=0.0, of="line_along_direction")
-    point_on_line_sigma: FloatArray = column(np.float64, fill=0.0, length=1, of="point_on_line")
-    lines_meeting_sigma: FloatArray = column(np.float64, fill=0.0, length=1, of="lines_meeting")
-    parallel_planes_sigma: FloatArray = column(np.float64, fill=0.0, of="parallel_planes")
-    perpendicular_planes_sigma: FloatArray = column(np.float64, fill=0.0, of="perpendicular_planes")
-    parallel_directions_sigma: FloatArray = column(np.float64, fill=0.0, of="parallel_directions")
-    perpendicular_directions_sigma: FloatArray = column(np.float64, fill=0.0, of="perpendicular_directions")
-    plane_across_direction_sigma: FloatArray = column(np.float64, fill=0.0, of="plane_across_direction")
-    plane_along_direction_sigma: FloatArray = column(np.float64, fill=0.0, of="plane_along_direction")
+    point_on_plane_sigma: FloatArray = column(np.float64, fill=0.0, length=1)
+    line_on_plane_sigma: FloatArray = column(np.float64, fill=0.0, length=1)
+    line_along_direction_sigma: FloatArray = column(np.float64, fill=0.0)
+    point_on_line_sigma: FloatArray = column(np.float64, fill=0.0, length=1)
+    lines_meeting_sigma: FloatArray = column(np.float64, fill=0.0, length=1)
+    parallel_planes_sigma: FloatArray = column(np.float64, fill=0.0)
+    perpendicular_planes_sigma: FloatArray = column(np.float64, fill=0.0)
+    parallel_directions_sigma: FloatArray = column(np.float64, fill=0.0)
+    perpendicular_directions_sigma: FloatArray = column(np.float64, fill=0.0)
+    plane_across_direction_sigma: FloatArray = column(np.float64, fill=0.0)
+    plane_along_direction_sigma: FloatArray = column(np.float64, fill=0.0)
 
     def __post_init__(self) -> None:
         for item in fields(self):
             value = convert(f"Relations.{item.name}", getattr(self, item.name), item)
-            if owner := item.metadata["of"]:
-                count = len(getattr(self, owner))
+            if item.name.endswith(_SIGMA):
+                count = len(getattr(self, item.name.removesuffix(_SIGMA)))
                 value = value if value.any() else np.zeros(count)  # none of its own is as if left out
                 if len(value) != count:
                     raise ShapeError(f"Relations.{item.name} must have one row for each of {count}; got {len(value)}.")
@@ -141,7 +144,7 @@ class Relations:
     @classmethod
     def kinds(cls) -> tuple[str, ...]:
         """Return the names of the columns that hold pairs."""
-        return tuple(item.name for item in fields(cls) if not item.metadata["of"])
+        return tuple(item.name for item in fields(cls) if not item.name.endswith(_SIGMA))
 
     def sigma(self, kind: str) -> FloatArray:
         """Return the standard deviations (R,) of one kind; 0 where the noise of the images tells them."""

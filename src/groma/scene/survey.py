@@ -41,7 +41,7 @@ class Kind(IntEnum):
 #: Kinds that have a place and can be eliminated beside each other, and kinds that have a direction.
 LOCATED = (Kind.IMAGE, Kind.CONTROL_POINT, Kind.LINE, Kind.PLANE)
 DIRECTED = (Kind.IMAGE, Kind.LINE, Kind.PLANE, Kind.DIRECTION)
-#: Powers of the unit of length in the covariance of a pose.
+#: Powers of the unit of length in the covariance of a pose (derived from its three shifts and three turns).
 _POSE_LENGTHS = ((2, 2, 2, 1, 1, 1),) * 3 + ((1, 1, 1, 0, 0, 0),) * 3
 
 

@@ -38,7 +38,6 @@ def column(
     world: str = "",
     length: int | tuple[Any, ...] = 0,
     optional: bool = False,
-    of: str = "",
     measured: bool = False,
     check: Callable[[str, Any], None] | None = None,
 ) -> Any:
@@ -64,15 +63,13 @@ def column(
         1 for depths and their standard deviations, -1 for inverse depths.
     optional : bool
         Whether files may lack the column; it then has no rows.
-    of : str
-        In :class:`~groma.scene.observations.Relations`: the column that this one has a row for each row of.
     measured : bool
         An instrument other than the cameras says so, in the world: it stays where the scene is moved to fit it.
     check : callable, optional
         Takes the name of the column and its numbers, and raises where they are not what they must be.
     """
     empty = tuple(0 if size is None else size for size in row)
-    about = {"dtype": np.dtype(dtype), "row": row, "fill": fill, "optional": optional, "of": of}
+    about = {"dtype": np.dtype(dtype), "row": row, "fill": fill, "optional": optional}
     about |= {"refers": (refers,) if isinstance(refers, str) else refers, "world": world, "length": length}
     about |= {"kinds": kinds, "measured": measured, "check": check}
     return field(default_factory=lambda: np.zeros((0, *empty), dtype), metadata=about)

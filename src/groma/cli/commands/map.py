@@ -106,6 +106,14 @@ def map_(
     min_length: Annotated[
         float, _options.LANDMARKS.option("Shortest line segment, pixels.", min=5.0, metavar="PX")
     ] = 12.0,
+    cluster_size: Annotated[
+        int,
+        _options.LANDMARKS.option(
+            "Map the lines of more images than this in clusters of at most N, joined across borders; 0: all at once.",
+            min=0,
+            metavar="N",
+        ),
+    ] = 250,
     min_confidence: Annotated[
         float,
         _options.LANDMARKS.option(
@@ -180,12 +188,14 @@ def map_(
     from groma.features.external import read_matches
     from groma.io import read_scene
     from groma.localization.extension import in_world_of
+    from groma.mapping.lines.options import MapLinesOptions
     from groma.mapping.map import MapOptions
 
     options = MapOptions(
         min_segment_length=min_length,
         detector=line_detector,
         matcher=line_matcher,
+        lines=MapLinesOptions(cluster_size=cluster_size),
         min_confidence=min_confidence,
         find_planes=planes,
         refine_points=refine_points,

@@ -25,14 +25,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from groma._typing import FloatArray, IntArray
+from groma._typing import IntArray
 from groma.errors import InputError
 from groma.execution import beside, work_with
+from groma.mapping.lines.by_clusters import map_lines_by_clusters
+from groma.mapping.lines.collect import line_map_of
 from groma.mapping.lines.filtering.filters import Evidence, filtered
 from groma.mapping.lines.filtering.texture import load_minimiser
 from groma.mapping.lines.hypotheses.directions import depth_ratios
 from groma.mapping.lines.hypotheses.earlier import EarlierMap
-from groma.mapping.lines.hypotheses.places import Places, find_places
+from groma.mapping.lines.hypotheses.places import find_places
 from groma.mapping.lines.line_map import LineMap, explain
 from groma.mapping.lines.linking.growth import grow
 from groma.mapping.lines.linking.merge import merge_agreeing
@@ -42,7 +44,7 @@ from groma.mapping.lines.neighbors import covisible_neighbors
 from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.outcomes import Outcome
 from groma.mapping.lines.views import build_views
-from groma.scene import Lines, Scene
+from groma.scene import Scene
 
 if TYPE_CHECKING:
     from groma.features.matching.wide_baseline import LineMatches
@@ -112,6 +114,8 @@ def map_lines(
     )
     with work_with():
         compared = choose(scene)
+        if matches is None and 0 < options.cluster_size < scene.num_images:
+            return map_lines_by_clusters(scene, segments, compared, options, report, earlier)
         views = build_views(scene, segments, options.min_length, options.noise, options.depth_margin)
         known = None if earlier is None or matches is not None else earlier.known(scene, views, compared, options.noise)
         if earlier is not None and earlier.same_cameras(scene):
@@ -131,45 +135,9 @@ def map_lines(
             size=np.column_stack([scene.cameras.width, scene.cameras.height])[scene.images.camera_idx],
             unmerged=unmerged,
         )
-        return _line_map(filtered(merge_agreeing(unmerged), evidence), compared, places, ratios)
-
-
-def _line_map(tracks: Tracks, neighbors: list[IntArray], places: Places, ratios: FloatArray) -> LineMap:
-    """Collect the result; lines run like most of their segments."""
-    views = tracks.views
-    rows, line_idx = tracks.members()
-    order = np.lexsort([views.image_idx[rows], line_idx])
-    rows, line_idx = rows[order], line_idx[order]
-    image_idx, ends = views.image_idx[rows], tracks.lines.copy()
-    turned = tracks.direction() < 0
-    ends[turned] = ends[turned][:, ::-1]
-    residual = np.sqrt(0.5 * tracks.squared[rows]) * tracks.sigma[rows]
-    outcomes = tracks.outcomes()
-    return LineMap(
-        lines=Lines.through(ends).plucker if len(ends) else np.zeros((0, 6)),
-        segments=ends,
-        image_idx=image_idx,
-        segment_idx=rows - views.pointers[image_idx],
-        line_idx=line_idx,
-        residual=residual,
-        num_images=tracks.num_images(),
-        median_residual=_medians(residual, line_idx, tracks.num_lines),
-        uncertainty=tracks.uncertainty,
-        outcomes=tuple(outcomes[views.rows(i)] for i in range(len(views.camera))),
-        neighbors=tuple(neighbors),
-        supporters=places.supporters.astype(np.int32),
-        rejection=places.rejection,
-        depth_ratios=ratios,
-    )
-
-
-def _medians(values: FloatArray, owner: IntArray, count: int) -> FloatArray:
-    """Median (count,) of the values of each owner; values come by owner, and each has some."""
-    if count == 0:
-        return np.zeros(0)
-    bounds = np.searchsorted(owner, np.arange(count + 1))
-    ordered = values[np.lexsort([values, owner])]
-    return 0.5 * (ordered[(bounds[:-1] + bounds[1:] - 1) // 2] + ordered[(bounds[:-1] + bounds[1:]) // 2])
+        tracks = filtered(merge_agreeing(unmerged), evidence)
+        rows = np.arange(len(views.image_idx))
+        return line_map_of(tracks, rows, views.pointers, tracks.outcomes(), compared, places, ratios)
 
 
 __all__ = [

@@ -27,12 +27,10 @@ class Cluster:
     rows: IntArray
 
     @staticmethod
-    def of(images: IntArray, neighbors: list[IntArray], views: LineViews) -> Cluster:
-        """Return the cluster of some images."""
+    def of(images: IntArray, neighbors: list[IntArray], pointers: IntArray) -> Cluster:
+        """Return the cluster of some images; rows of image i are ``pointers[i] : pointers[i + 1]``."""
         known = np.unique(np.concatenate([images, *(neighbors[i] for i in images)]))
-        spans = (views.rows(int(i)) for i in known)
-        rows = np.concatenate([np.arange(span.start, span.stop) for span in spans])
-        return Cluster(np.sort(images), known, rows)
+        return Cluster(np.sort(images), known, rows_of_images(known, pointers))
 
     def views(self, views: LineViews) -> LineViews:
         """Return the part of the table that belongs to the cluster and its ring."""
@@ -57,14 +55,20 @@ class Cluster:
         return np.where(rows >= 0, self.rows[rows], rows) if len(self.rows) else rows
 
 
+def rows_of_images(images: IntArray, pointers: IntArray) -> IntArray:
+    """Rows of the segments of some images; those of image i are ``pointers[i] : pointers[i + 1]``."""
+    return np.concatenate([np.zeros(0, np.int64), *(np.arange(*pointers[i : i + 2].tolist()) for i in images)])
+
+
 #: Columns of :class:`LineViews` with a row for each image.
 _OF_IMAGES = ("camera", "center", "inverse_depth")
 
 
-def clusters(neighbors: list[IntArray], count: int, views: LineViews) -> list[Cluster]:
+def clusters(neighbors: list[IntArray], count: int, pointers: IntArray) -> list[Cluster]:
     """Divide images into at most so many clusters of about equal size, of images that are near each other.
 
-    Images are ordered so that neighbours come close (reverse Cuthill-McKee), and the order is cut.
+    Images are ordered so that neighbours come close (reverse Cuthill-McKee), and the order is cut. Rows of
+    the segments of image i are ``pointers[i] : pointers[i + 1]``.
     """
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import reverse_cuthill_mckee
@@ -75,4 +79,4 @@ def clusters(neighbors: list[IntArray], count: int, views: LineViews) -> list[Cl
     both_ways = np.append(first, near), np.append(near, first)
     graph = csr_array((np.ones(2 * len(near), np.int8), both_ways), (number, number))
     order = np.asarray(reverse_cuthill_mckee(graph, symmetric_mode=True), np.int64)
-    return [Cluster.of(part, neighbors, views) for part in np.array_split(order, count) if len(part)]
+    return [Cluster.of(part, neighbors, pointers) for part in np.array_split(order, count) if len(part)]

@@ -47,6 +47,10 @@ class MapLinesOptions:
     #: where the scene as a whole is less repeatable. 0 keeps all lines of texture, also those that
     #: :mod:`groma.mapping.lines.filtering.texture` finds.
     min_repeatability: float = 0.4
+    #: Lines of more images than this are mapped cluster by cluster, each of at most so many images, and joined across
+    #: borders (:mod:`groma.mapping.lines.by_clusters`); 0: all at once (cost: memory
+    #: of a process).
+    cluster_size: int = 250
     #: Use lines through known points as further proposals.
     use_points: bool = True
     #: Use vanishing directions, alone and with known points.

@@ -18,7 +18,7 @@ import numpy as np
 from groma import cameras as camera_models
 from groma._trees import kd_tree
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.execution import map_work
+from groma.execution import map_in_threads, map_work
 from groma.gates import gate
 from groma.geometry import quaternion, segment2
 from groma.mapping.groups import grouped
@@ -135,6 +135,28 @@ def build_views(
         pointers=np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
         image_idx=np.repeat(np.arange(count), sizes),
         line=segment2.to_line(columns["ends"]),
+        **columns,
+    )
+
+
+def views_of_rows(
+    scene: Scene, segments: Sequence[Segments], rows: IntArray, min_length: float, noise: float
+) -> LineViews:
+    """Return the table of some segments, ascending ``rows`` among all, without where to look for them in depth."""
+    first = np.concatenate([[0], np.cumsum([len(one) for one in segments])])
+    bounds = np.searchsorted(rows, first)
+    chosen = [one.select(rows[bounds[i] : bounds[i + 1]] - first[i]) for i, one in enumerate(segments)]
+    undistorted = map_in_threads(lambda i: _undistorted(scene, i, chosen[i], min_length), range(scene.num_images))
+    columns = {name: np.concatenate([part[name] for part in undistorted]) for name in undistorted[0]}
+    return LineViews(
+        camera=_cameras(scene),
+        center=scene.cam_centers_in_world,
+        inverse_depth=np.full((scene.num_images, 2), np.nan),
+        pointers=bounds.astype(np.int64),
+        image_idx=np.repeat(np.arange(scene.num_images), np.diff(bounds)),
+        sigma=np.hypot(np.concatenate([one.sigma for one in chosen]), noise),
+        line=segment2.to_line(columns["ends"]),
+        range=np.full((len(rows), 2), np.nan),
         **columns,
     )
 

@@ -66,20 +66,49 @@ def well_determined(tracks: Tracks, evidence: Evidence) -> Verdict:
     return was_certain | is_certain(tracks, evidence.options), Outcome.UNCERTAIN
 
 
-def not_texture(tracks: Tracks, evidence: Evidence, gates: FilterGates = FilterGates()) -> Verdict:
+def not_texture(tracks: Tracks, evidence: Evidence) -> Verdict:
     """Of a kind of segments that is found again, and shown by the images that should show it."""
-    options, views = evidence.options, tracks.views
-    if options.min_repeatability <= 0.0 or tracks.num_lines == 0:
+    views = tracks.views
+    if evidence.options.min_repeatability <= 0.0 or tracks.num_lines == 0:
         return np.ones(tracks.num_lines, bool), Outcome.TEXTURE
+    kinds = SegmentKinds(views.length, evidence.strength, views.sigma, tracks.rejection)
+    expected = num_expected(tracks, evidence.neighbors, evidence.size, evidence.options.min_length)
+    return is_edge(kinds, tracks.line_of, tracks.num_images(), expected, evidence.options), Outcome.TEXTURE
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentKinds:
+    """What tells segments (S,) of edges from those of texture."""
+
+    #: (S,) pixels.
+    length: FloatArray
+    #: (S,) gradient across each, grey levels per pixel.
+    strength: FloatArray
+    #: (S,) standard deviation across each, pixels.
+    sigma: FloatArray
+    #: (S,) the :class:`Outcome` of those without a line.
+    rejection: IntArray
+
+
+def is_edge(
+    kinds: SegmentKinds,
+    line_of: IntArray,
+    seen: IntArray,
+    expected: IntArray,
+    options: MapLinesOptions,
+    gates: FilterGates = FilterGates(),
+) -> BoolArray:
+    """(L,) lines of segments that are found again, and shown by those that should show them.
+
+    ``line_of`` (S,) is the line of each segment, -1 for none; ``seen`` and ``expected`` (L,) are numbers of images.
+    """
     # Segments that no neighbour or geometry lets become part of a line say nothing about others of their kind.
-    possible = views.usable & ~np.isin(tracks.rejection, (Outcome.NO_NEIGHBOR, Outcome.DEGENERATE))
-    again = found_again(
-        views.length, evidence.strength, tracks.line_of, possible, tracks.num_lines, options.min_repeatability
-    )
-    expected = num_expected(tracks, evidence.neighbors, evidence.size, options.min_length)
-    kinds = views.length, evidence.strength, views.sigma
-    odds = edge_odds(kinds, tracks.line_of, possible, tracks.num_images(), expected, options.min_images)
-    return again & (odds >= logit(gates.min_edge_probability)), Outcome.TEXTURE
+    possible = ~np.isin(kinds.rejection, (Outcome.TOO_SHORT, Outcome.NO_NEIGHBOR, Outcome.DEGENERATE))
+    least = options.min_repeatability
+    again = found_again(kinds.length, kinds.strength, line_of, possible, len(seen), least)
+    told = kinds.length, kinds.strength, kinds.sigma
+    odds = edge_odds(told, line_of, possible, seen, expected, options.min_images)
+    return again & (odds >= logit(gates.min_edge_probability))
 
 
 def not_duplicate(tracks: Tracks, evidence: Evidence) -> Verdict:
@@ -99,6 +128,9 @@ def long_enough(tracks: Tracks, evidence: Evidence) -> Verdict:
 
 #: The filters, in their order.
 FILTERS: tuple[Filter, ...] = (seen_by_enough_images, well_determined, not_texture, not_duplicate, long_enough)
+
+#: Those that need no more than what is around a line; texture is learned from all segments of a scene.
+NEARBY: tuple[Filter, ...] = tuple(one for one in FILTERS if one is not not_texture)
 
 
 def filtered(tracks: Tracks, evidence: Evidence, filters: tuple[Filter, ...] = FILTERS) -> Tracks:

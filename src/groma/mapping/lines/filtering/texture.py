@@ -29,7 +29,7 @@ import numpy as np
 from scipy.special import betaln, expit, gammaln, log_expit
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.execution import map_work
+from groma.execution import map_in_threads
 from groma.gates import gate
 from groma.mapping.lines.filtering.kinds import features_of
 from groma.mapping.lines.linking.tracks import Tracks
@@ -72,7 +72,7 @@ def num_expected(tracks: Tracks, neighbors: list[IntArray], size: IntArray, min_
     bound = np.where(size > 0, size, np.inf)
     count = np.zeros(tracks.num_lines, np.int64)
     work = [(P, tracks.lines[lines], limit) for P, lines, limit in zip(tracks.views.camera, reach, bound, strict=True)]
-    for lines, shown in zip(reach, map_work(partial(_shown_in, min_length), work), strict=True):
+    for lines, shown in zip(reach, map_in_threads(partial(_shown_in, min_length), work), strict=True):
         count[lines[shown]] += 1
     return np.maximum(count, tracks.num_images())
 

@@ -62,13 +62,22 @@ class Places:
             rejection=np.full(count, rejection, np.int64),
         )
 
+    @staticmethod
+    def names() -> tuple[str, ...]:
+        """The columns."""
+        return tuple(item.name for item in fields(Places))
+
     def where(self, chosen: BoolArray, other: Places) -> Places:
         """Return these places where chosen (S,), and those of another elsewhere."""
         columns = {}
-        for item in fields(self):
-            one, two = getattr(self, item.name), getattr(other, item.name)
-            columns[item.name] = np.where(chosen.reshape(-1, *[1] * (one.ndim - 1)), one, two)
+        for name in self.names():
+            one, two = getattr(self, name), getattr(other, name)
+            columns[name] = np.where(chosen.reshape(-1, *[1] * (one.ndim - 1)), one, two)
         return Places(**columns)
+
+    def take(self, rows: IntArray) -> Places:
+        """Return the places of some segments; supporters keep their numbers."""
+        return Places(**{name: getattr(self, name)[rows] for name in self.names()})
 
     def ends_in_space(self, views: LineViews) -> FloatArray:
         """(S, 2, 3) end points in the world; meaningless without a place."""
@@ -107,14 +116,14 @@ def find_places(
     work = list(zip(range(len(neighbors)), neighbors, points, known or [None] * len(neighbors), strict=True))
     proposer, calls = Proposer(views, ratios, options), num_calls()
     if calls and matches is None:
-        parts = [_Part.of(cluster, proposer, work) for cluster in clusters(neighbors, calls, views)]
+        parts = [_Part.of(cluster, proposer, work) for cluster in clusters(neighbors, calls, views.pointers)]
         in_order = np.argsort(np.concatenate([part.cluster.images for part in parts]))
         by_part = [place for places in map_work(_places_of, parts, progress) for place in places]
         found = [by_part[place] for place in in_order]
     else:
         found = map_work(partial(_places_in, proposer, matches), work, progress)
     found = [Places.none(0, max(1, options.num_neighbors), Outcome.NO_MATCH), *found]
-    columns = {item.name: np.concatenate([getattr(one, item.name) for one in found]) for item in fields(Places)}
+    columns = {name: np.concatenate([getattr(one, name) for one in found]) for name in Places.names()}
     columns["rejection"][~views.usable] = Outcome.TOO_SHORT
     return Places(**columns)
 
