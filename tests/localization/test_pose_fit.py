@@ -13,11 +13,12 @@ from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.focal_length import focal_step
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
-from groma.localization.pose.pose_fit import FitGates, fit_pose
+from groma.localization.pose.pose_fit import fit_pose
 from groma.localization.pose.refinement import landmark_weights, problem_of, refine
+from groma.solver.options import SolverOptions
 
 #: Ends where a step gains nothing in double precision.
-TO_THE_END = FitGates(gain=1e-15, steps=100)
+TO_THE_END = SolverOptions(function_tolerance=1e-15, max_iterations=100)
 
 
 def scaled(factor, camera=CAMERA):

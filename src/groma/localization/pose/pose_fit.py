@@ -1,39 +1,35 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Steps of one pose to the minimum of a robust cost: damped least squares without the machinery of large problems.
+"""One pose, with a focal length where that is wanted, as a problem of the solver's loop.
 
-A photograph asks for a dozen fits of six unknowns. What a general solver prepares for each, layouts, orders and
-threads, takes longer than the sums themselves.
+A photograph asks for a dozen fits of six unknowns. What a problem of many variables is prepared with, layouts, orders
+and threads, takes longer than the sums themselves; here they are one product of weighted records.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from groma._numba import loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.factors.losses import Loss, loss_derivatives
-from groma.gates import gate
 from groma.localization.pose.records import records
 from groma.localization.pose.residuals import near_of
 from groma.problem.problem import Problem
+from groma.solver.damped_problem import Trial
+from groma.solver.levenberg_marquardt import NielsenDamping, predicted_decrease
+from groma.solver.options import SolverOptions
+from groma.solver.report import SolveReport, Stopwatch
+from groma.solver.solve import minimise
+from groma.solver.steps import largest_slope
+from groma.solver.termination import Termination
 
-
-@dataclass(frozen=True)
-class FitGates:
-    """When the steps of a fit end."""
-
-    gain: float = gate(1e-5, "share", "of the cost, that a step must gain", "cost: of steps")
-    steps: int = gate(12, "steps", "at most", "cost: of steps")
-
-
-#: Of a fit that only collects what is near, and of the last one.
-ROUGHLY, FINELY = FitGates(gain=1e-3), FitGates()
-
-#: First damping, relative to the diagonal of the normal equations, and by how much it changes (cost: of steps).
-_DAMPING, _CHANGE = 1e-6, 10.0
+#: Of a fit that only collects what is near, and of the last one (cost: of steps).
+ROUGHLY, FINELY = (SolverOptions(max_iterations=12, function_tolerance=share) for share in (1e-3, 1e-5))
+#: First damping: what agrees is near its minimum (cost: of steps).
+_DAMPING = 1e-6
 #: Largest step of the logarithm of a focal length: what is near changes by more.
 _FARTHEST = 0.3
 
@@ -70,7 +66,7 @@ def fit_pose(
     weights: Sequence[FloatArray],
     near: tuple[BoolArray, BoolArray],
     loss: Loss,
-    gates: FitGates,
+    options: SolverOptions,
     focal: IntArray | None = None,
 ) -> dict[str, FloatArray]:
     """Return the states of a problem of one pose that a robust cost is least at; landmarks are held.
@@ -83,85 +79,132 @@ def fit_pose(
         Which of its points and lines take part.
     loss
         On squared whitened residuals.
-    gates
+    options
         When it ends.
     focal
         The focal lengths among the parameters of its camera, if all of them may change by one factor; else they are
         held.
     """
     kept: dict[str, BoolArray] = dict(zip(("points", "lines"), near, strict=True))
-    fit = _Fit(problem, weights, [near_of(factor, kept) for factor in problem.factors], loss, focal)
-    states = {name: group.state for name, group in problem.variables.items() if fit.moves(name)}
-    cost, hidden, total = fit.equations(states)
-    damping = _DAMPING
-    for _ in range(gates.steps):
-        step, promised = _step(total, damping)
-        if not promised > 0.0:
-            break
-        moved = fit.moved(states, step)
-        if promised <= gates.gain * cost:
-            return moved
-        new = fit.equations(moved)
-        if new[0] < cost and new[1] <= hidden:
-            gained = cost - new[0]
-            states, (cost, hidden, total), damping = moved, new, max(damping / _CHANGE, _DAMPING)
-            if gained <= gates.gain * cost:
-                break
-        else:
-            damping *= _CHANGE
-    return states
+    rows = [near_of(factor, kept) for factor in problem.factors]
+    fit = _PoseProblem(problem, weights, rows, loss, focal, options.function_tolerance)
+    report = SolveReport()
+    minimise(fit, options, report, Stopwatch(report))
+    return fit.here.states
 
 
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """What a fit evaluates: factors with their weights, which of their rows are near, and what moves."""
+@dataclass(frozen=True, kw_only=True)
+class _PoseTrial(Trial):
+    """States, and the products of weighted derivatives and residuals there."""
 
-    problem: Problem
-    weights: Sequence[FloatArray]
-    near: Sequence[BoolArray]
-    loss: Loss
-    focal: IntArray | None
+    states: dict[str, FloatArray]
+    total: FloatArray
 
-    def moves(self, group: str) -> bool:
-        """Whether a group of variables moves."""
-        return group == "frames" or (self.focal is not None and group.startswith("intrinsics"))
 
-    def moved(self, states: dict[str, FloatArray], step: FloatArray) -> dict[str, FloatArray]:
+class _PoseProblem:
+    """Factors of one pose with their weights; a :class:`groma.solver.damped_problem.DampedProblem`.
+
+    Costs come with derivatives, so that a step that is accepted is linearised already. A step that promises too little
+    to go on is the last one, and is taken without asking the cost.
+    """
+
+    linear_iterations = 0
+
+    def __init__(
+        self,
+        problem: Problem,
+        weights: Sequence[FloatArray],
+        near: Sequence[BoolArray],
+        loss: Loss,
+        focal: IntArray | None,
+        tolerance: float,
+    ) -> None:
+        self._problem, self._weights, self._near, self._loss, self._focal = problem, weights, near, loss, focal
+        self._tolerance = tolerance
+        self._damping = NielsenDamping(_DAMPING)
+        moves = {n for n in problem.variables if n == "frames" or (focal is not None and n.startswith("intrinsics"))}
+        self.here = self._evaluated({name: problem.variables[name].state for name in moves})
+
+    @property
+    def num_factors(self) -> int:
+        return sum(int(near.sum()) for near in self._near)
+
+    @property
+    def damping(self) -> float:
+        return self._damping.value
+
+    def start(self) -> _PoseTrial:
+        return self.here
+
+    def linearize(self) -> None:
+        """Do nothing: see the class."""
+
+    def largest_gradient(self) -> float:
+        return largest_slope(self.here.total[:-1, -1], np.diag(self.here.total)[:-1])
+
+    def is_curved(self) -> bool:
+        return bool(np.diag(self.here.total)[:-1].any())
+
+    def try_step(self) -> _PoseTrial:
+        H, g = self.here.total[:-1, :-1], self.here.total[:-1, -1]
+        diagonal = np.diag(H)
+        if not (diagonal > 0.0).all():
+            return self.here.without_step()
+        scale = 1.0 / np.sqrt(diagonal)
+        try:
+            scaled = H * np.outer(scale, scale) + self.damping * np.eye(len(g))
+            step = -scale * np.linalg.solve(scaled, scale * g)
+        except np.linalg.LinAlgError:
+            return self.here.without_step()
+        promised, withheld = predicted_decrease([(diagonal, g, step)], None, (0.0, 0.0), self.damping)
+        moved = self._moved(step)
+        if promised <= self._tolerance * self.here.cost:
+            return replace(self.here, states=moved, promised=0.0)
+        tried = self._evaluated(moved)
+        ratio = (self.here.cost - tried.cost) / promised if promised > 0.0 else 0.0
+        length = float(np.linalg.norm(step))
+        return replace(tried, gain_ratio=ratio, promised=promised, withheld=withheld, length=length)
+
+    def stretch(self, trial: _PoseTrial, factor: float) -> _PoseTrial:
+        """Return the trial: another length costs as much as another step."""
+        return trial
+
+    def refine(self, trial: _PoseTrial) -> _PoseTrial:
+        return trial
+
+    def rescue(self, trial: _PoseTrial) -> _PoseTrial:
+        return trial
+
+    def accept(self, trial: _PoseTrial) -> None:
+        self.here = trial
+        self._damping.accept(trial.gain_ratio)
+
+    def refuse(self, trial: _PoseTrial) -> Termination | None:
+        return self._damping.refuse(trial) if trial.has_step else Termination.SINGULAR
+
+    def _moved(self, step: FloatArray) -> dict[str, FloatArray]:
         """States after a step of the pose, and of the logarithm of the focal length."""
-        pose = self.problem.variables["frames"].manifold
+        states = self.here.states
+        pose = self._problem.variables["frames"].manifold
         found = {"frames": pose.retract(states["frames"], step[None, :6])}
         for name, state in states.items():
             if name != "frames":
                 found[name] = state.copy()
-                found[name][:, self.focal] *= np.exp(np.clip(step[6], -_FARTHEST, _FARTHEST))
+                found[name][:, self._focal] *= np.exp(np.clip(step[6], -_FARTHEST, _FARTHEST))
         return found
 
-    def equations(self, states: dict[str, FloatArray]) -> tuple[float, int, FloatArray]:
-        """The cost, how many cannot be evaluated, and the products of weighted derivatives and residuals."""
+    def _evaluated(self, states: dict[str, FloatArray]) -> _PoseTrial:
+        """Evaluate costs and products at some states."""
         cost, hidden, total = 0.0, 0, 0.0
-        problem = self.problem.with_states(states)
+        problem = self._problem.with_states(states)
         lens = next((state[0] for name, state in states.items() if name != "frames"), None)
         wanted = {"pose": 6} if lens is None else {"pose": 6, "intrinsics": len(lens)}
-        for factor, weight, near in zip(problem.factors, self.weights, self.near, strict=True):
+        for factor, weight, near in zip(problem.factors, self._weights, self._near, strict=True):
             record = records(problem, factor, wanted)
-            own, blind = _weigh(record, weight, near, self.loss.tag, self.loss.parameters)
+            own, blind = _weigh(record, weight, near, self._loss.tag, self._loss.parameters)
             rows = record.reshape(-1, record.shape[2])
             if lens is not None:
-                by_focal = rows[:, 6:-1][:, self.focal] @ lens[self.focal]
+                by_focal = rows[:, 6:-1][:, self._focal] @ lens[self._focal]
                 rows = np.column_stack([rows[:, :6], by_focal, rows[:, -1]])
             cost, hidden, total = cost + own, hidden + blind, total + rows.T @ rows
-        return cost, hidden, np.asarray(total)
-
-
-def _step(total: FloatArray, damping: float) -> tuple[FloatArray, float]:
-    """The step of damped normal equations, and by how much it promises to lower the cost; zero without one."""
-    H, g = total[:-1, :-1], total[:-1, -1]
-    diagonal = np.diag(H)
-    if not (diagonal > 0.0).all():
-        return np.zeros(len(g)), 0.0
-    scale = 1.0 / np.sqrt(diagonal)
-    try:
-        step = -scale * np.linalg.solve(H * np.outer(scale, scale) + damping * np.eye(len(g)), scale * g)
-    except np.linalg.LinAlgError:
-        return np.zeros(len(g)), 0.0
-    return step, float(-(g @ step) - 0.5 * step @ H @ step)
+        return _PoseTrial(cost=cost, num_hidden=hidden, states=states, total=np.asarray(total))
