@@ -52,7 +52,7 @@ from groma.mapping.lines.confidence import DEFAULT_CONFIDENCE
 from groma.mapping.lines.hypotheses.earlier import EarlierMap
 from groma.mapping.lines.in_views import map_lines_in_views
 from groma.mapping.lines.options import MIN_LENGTH
-from groma.mapping.noise.observations import line_end_correlation, moved_px, noise_px, with_point_noise
+from groma.mapping.noise.observations import line_bend, line_end_correlation, moved_px, noise_px, with_point_noise
 from groma.mapping.noise.shared import with_shared_noise
 from groma.mapping.photographs import check_images, check_number, image_files, image_reader, images_left_out
 from groma.mapping.read_rows import adjust_read_rows, mapped_as_measured, read_by_rows, taken_at_once
@@ -286,7 +286,9 @@ def map_segments(
         if scene.num_lines == 0 or moved_px(before, joint, GATES.moved_share) <= options.lines.noise:
             break
     if scene.num_lines:
-        weighted = dataclasses.replace(weighted, loss="cauchy", loss_scale=GATES.last_loss_scale)
+        bend = math.inf if options.refine_poses else line_bend(scene, weighted.line_end_correlation)
+        tails = {"loss_scale": GATES.last_loss_scale, "line_loss_factor": min(bend / GATES.last_loss_scale, 1.0)}
+        weighted = dataclasses.replace(weighted, loss="cauchy", **tails)
     sigma_px = weighted.point_sigma_px, weighted.line_sigma_px * math.sqrt(1.0 + weighted.line_end_correlation)
     if options.find_planes:
         scene = stages.run(find_planes, scene)
@@ -296,7 +298,7 @@ def map_segments(
     else:
         scene = with_shared_noise(scene, *sigma_px)
     adjusted = stages.run(adjust_everything, scene, weighted)
-    return result_of(points, scene, adjusted, weighted, line_map, options.min_confidence)
+    return result_of(points, scene, adjusted, weighted, line_map, options.min_confidence, not options.refine_poses)
 
 
 # --------------------------------------------------------------------------------------------------------------- stages
