@@ -4,12 +4,14 @@
 Truth is the same scene near the origin.
 """
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from groma.adjustment.adjust import AdjustOptions, adjust
-from groma.adjustment.assemble import AssemblyOptions
+from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.diagnosis import diagnose_scene
 from groma.adjustment.uncertainty import uncertainty
 from groma.factors import PoseBetween
@@ -84,6 +86,27 @@ def test_what_is_known_does_not_depend_on_the_unit_of_length(start, near, expone
     assert far["center"]["median"] == pytest.approx(unit * here["center"]["median"], rel=1e-6)
     assert far["rotation_deg"]["median"] == pytest.approx(here["rotation_deg"]["median"], rel=1e-6)
     assert [f.sentence for f in there.diagnose().findings] == [f.sentence for f in near.diagnose().findings]
+
+
+@pytest.mark.parametrize("held", [None, "turns", "places", "pose"])
+def test_what_is_free_does_not_depend_on_the_unit_of_length(held):
+    """Points alone, with what of the first camera is held: as many free motions, the same words, the same knowledge."""
+    start, found = holistic(8, noise_px=0.5, seed=1).truth.points_only(), []
+    for unit in (1.0, 1e-12, 1e-8, 1e8, 1e12):
+        scene = start.transformed(Similarity(scale=unit))
+        problem = assemble(scene, AssemblyOptions(gauge="free")).problem
+        constant = np.zeros((scene.num_frames, 6), bool)
+        constant[0] = {None: [0] * 6, "turns": [0, 0, 0, 1, 1, 1], "places": [1, 1, 1, 0, 0, 0], "pose": [1] * 6}[held]
+        frames = replace(problem.variables["frames"], constant=constant)
+        problem = Problem({**problem.variables, "frames": frames}, problem.factors)
+        said = diagnose_scene(scene, problem=problem)
+        centers = uncertainty(scene, gauge="inner", problem=problem).centers / unit**2
+        found.append((said.num_free_motions, [one.sentence for one in said.findings], centers))
+    assert found[0][0] == {None: 7, "turns": 4, "places": 4, "pose": 1}[held]
+    for number, sentences, centers in found[1:]:
+        assert number == found[0][0]
+        assert sentences == found[0][1]
+        np.testing.assert_allclose(centers, found[0][2], rtol=1e-4, atol=1e-7 * found[0][2].max())
 
 
 @pytest.mark.parametrize("exponent", [-12, 12])

@@ -123,6 +123,14 @@ def test_tables_are_aligned_and_leave_out_what_nothing_has(capsys):
     ]
 
 
+def test_what_is_wrong_in_every_file_is_told_once(capsys):
+    many = [f"{k:04d}.png has no right image." for k in range(37, 41)]
+    few = [f"{k}.jpg cannot be read." for k in range(3)]
+    Console(False, False, None).warn_of_all([*many, *few, "The map is in pieces."])
+    expected = [f"{many[0]} The same of 3 others.", *few, "The map is in pieces."]
+    assert capsys.readouterr().err.splitlines() == [f"warning: {text}" for text in expected]
+
+
 def test_sentences_are_broken_between_words_on_a_terminal_only(monkeypatch, capsys):
     be_terminal(monkeypatch)
     sentence = "  some words, " * 12

@@ -217,6 +217,18 @@ def test_without_times_lines_belong_together():
     assert score_trajectory(truth.take(np.arange(0, 40, 3)), truth).warnings == ()  # the shorter one counts
 
 
+def test_an_error_of_scale_is_told():
+    """And only where it is one: not of positions that err otherwise, and not where the scale was aligned."""
+    truth = wander(60, seed=2)
+    small = truth.replace(world_from_cam=truth.world_from_cam * ([1] * 4 + [0.2] * 3))
+    (said,) = score_trajectory(small, truth, "se3").warnings
+    assert "times 5 the position error would be" in said and "sim3" in said
+    assert not score_trajectory(small, truth, "sim3").warnings
+    noise = np.random.default_rng(0).normal(size=(60, 7)) * ([0] * 4 + [0.1] * 3)
+    assert not score_trajectory(truth.replace(world_from_cam=truth.world_from_cam + noise), truth, "se3").warnings
+    assert not score_trajectory(truth, truth, "se3").warnings
+
+
 def test_unrelated_trajectories_are_noticed():
     """Others have other orientations, even where a path is like another; noise and a wrong scale are no other."""
     truth = wander(60, seed=1)
@@ -230,7 +242,7 @@ def test_unrelated_trajectories_are_noticed():
     noisy[:, 4:] += rng.normal(0, 2.0, (60, 3))
     assert score_trajectory(truth.replace(world_from_cam=noisy), truth).warnings == ()
     small = truth.replace(world_from_cam=apply_similarity(Similarity(0.1), truth.world_from_cam))
-    assert score_trajectory(small, truth, "se3").warnings == ()
+    assert not any("unrelated" in text for text in score_trajectory(small, truth, "se3").warnings)
 
 
 def test_the_command_warns_and_finds_times_beside_the_reference(tmp_path):

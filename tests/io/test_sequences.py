@@ -97,6 +97,14 @@ def test_faults(tum):
     assert "0.png is 32x24, not 64x48 grey" in text
 
 
+def test_a_picture_of_depths_is_no_depth(tum):
+    """Of 8 bits, in steps of four centimetres or a map of the wrong size; a frame without depth is honest."""
+    image(tum / "depth/0.png", 20)
+    sequence = open_sequence(tum)
+    assert next(iter(sequence)).depth is None
+    assert "0.png has 8 bits, too few for distances" in "\n".join(sequence.warnings)
+
+
 def test_depth_without_value(tum):
     raw = np.full((48, 64), 5000, np.uint16)
     raw[0, 0], raw[0, 1] = 65535, 0

@@ -15,7 +15,7 @@ from groma.geometry.charts.line_charts import LINE_CHARTS
 from groma.geometry.charts.plane_charts import PLANE_CHARTS
 from groma.geometry.charts.unit3 import DIRECTION_CHARTS
 from groma.geometry.conversions import convert_covariance
-from groma.problem.gauge import world_motions
+from groma.problem.gauge import gauge_directions, world_motions
 from groma.problem.lay_out import lay_out
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
@@ -179,15 +179,22 @@ def test_a_prior_leaves_only_what_it_leaves():
     assert np.isfinite(covariances.of("points")).all()
 
 
+@pytest.mark.parametrize("unit", [1e-12, 1.0, 1e12])
 @pytest.mark.parametrize("seed", range(8))
-def test_one_held_pose_leaves_the_scale_alone(seed):
-    """Whatever the rounding: of the seven motions one combination leaves the pose, and two poses leave none."""
-    motions = world_motions(scene_problem(seed=seed, num_points=10), np.array([0.1, 0.2, 0.3]), 2.0)["poses"]
-    (only,) = unmoved(motions[:, 0].T).T
-    np.testing.assert_allclose(motions[:, 0].T @ only, 0.0, atol=1e-12)
+def test_one_held_pose_leaves_the_scale_alone(seed, unit):
+    """Whatever the rounding and the unit: of seven motions one combination leaves the pose, and two poses leave none.
+
+    A held position leaves the turns about it and the scale, a held orientation the translations and the scale.
+    """
+    poses = scene_problem(seed=seed, num_points=10).variables["poses"]
+    state = poses.state * [1, 1, 1, 1, unit, unit, unit]
+    motions = gauge_directions(poses.manifold, state, unit * np.array([0.1, 0.2, 0.3]), 2.0 * unit)
+    (only,) = unmoved(motions[:, 0].T, 2.0 * unit).T
+    np.testing.assert_allclose(motions[:, 0].T @ only, 0.0, atol=1e-12 * max(unit, 1.0))
     assert abs(only[6]) > 0.1
-    assert unmoved(motions[:, :2].reshape(7, -1).T).shape == (7, 0)
-    assert unmoved(motions[:, 0, 3:].T).shape == (7, 4)
+    assert unmoved(motions[:, :2].reshape(7, -1).T, 2.0 * unit).shape == (7, 0)
+    assert unmoved(motions[:, 0, :3].T, 2.0 * unit).shape == (7, 4)
+    assert unmoved(motions[:, 0, 3:].T, 2.0 * unit).shape == (7, 4)
 
 
 def test_free_scene_is_refused_with_the_remedy():

@@ -36,6 +36,12 @@ class ScoreGates:
     )
     time_difference: float = gate(0.01, "s", "times of poses that belong together", "convention: half of TUM's 0.02 s")
     associated: float = gate(0.5, "share", "less of the shorter side in both is warned of", "convention: half")
+    but_for_scale: float = gate(
+        0.25,
+        "share",
+        "of the position error is left with a scale: it is told",
+        "convention: fifteen sixteenths of a sum of squares",
+    )
     unrelated_deg: float = gate(
         60.0,
         "deg",

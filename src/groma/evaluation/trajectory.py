@@ -182,7 +182,11 @@ def score_trajectory(
     drift, turn, lengths, path = _drift(aligned, truth)
     if align != "none" and np.linalg.norm(errors) >= np.linalg.norm(truth[:, 4:] - truth[:, 4:].mean(axis=0)):
         drift, turn, lengths = None, None, ()  # its way is no longer than the noise of its positions
-    doubts = (_few_in_common(ours, theirs, len(i)), unrelated(errors, truth[:, 4:], np.degrees(angles)))
+    doubts = (
+        _few_in_common(ours, theirs, len(i)),
+        unrelated(errors, truth[:, 4:], np.degrees(angles)),
+        _another_scale(poses, truth, errors) if align == "se3" else None,
+    )
     return TrajectoryScores(
         ate=Spread.of(errors),
         rotation_deg=Spread.of(np.degrees(angles)),
@@ -290,6 +294,21 @@ def _few_in_common(estimate: Trajectory, reference: Trajectory, count: int) -> s
     return (
         f"Only {count:,} of {len(estimate):,} and {len(reference):,} poses are associated, perhaps wrongly: the scores "
         f"are of these alone. By their times the two hardly overlap; {hint}."
+    )
+
+
+def _another_scale(poses: FloatArray, truth: FloatArray, errors: FloatArray) -> str | None:
+    """Return a sentence where most of the error is one of scale."""
+    if len(poses) < 3:
+        return None
+    found = pose_alignment(se3.inverse(poses), se3.inverse(truth)).similarity
+    left = np.linalg.norm(apply_similarity(found, poses)[:, 4:] - truth[:, 4:], axis=1)
+    before, after = (Spread.of(distances).rmse for distances in (errors, left))
+    if after > SCORES.but_for_scale * before or abs(found.scale - 1.0) < 1e-9:  # of equal ones rounding is left
+        return None
+    return (
+        f"Most of the error is one of scale: with the estimate times {found.scale:.4g} the position error would be "
+        f"{after:.4g}. A single camera does not know its scale: --align sim3."
     )
 
 

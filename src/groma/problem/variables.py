@@ -35,7 +35,7 @@ class Variables:
         if not np.isfinite(state).all():
             bad = int(np.flatnonzero(~np.isfinite(state).all(axis=1))[0])
             raise ProblemError(
-                f"The state of variable {bad} is not finite ({self.manifold.kind}): {state[bad]}. "
+                f"The state of variable {bad} is not finite ({self.manifold.kind}): {state[bad].tolist()}. "
                 "Remove or re-initialise it."
             )
         object.__setattr__(self, "state", state)

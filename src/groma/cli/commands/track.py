@@ -169,5 +169,4 @@ def _say(console: Console, numbers: dict[str, Any]) -> None:
             f"square, units of the reference) over {scores['path_length']:.2f}"
             + (f"; drift {drift:.2f} %, {scores['drift_deg_per_metre']:.4f} deg per unit" if drift is not None else "")
         )
-    for sentence in numbers["warnings"]:
-        console.warn(sentence)
+    console.warn_of_all(numbers["warnings"])

@@ -2,10 +2,12 @@
 """What a command says: text, tables, warnings, and what goes on meanwhile."""
 
 import os
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from groma._counted import counted
 from groma.cli.shared.progress import Plan, Progress, Stages
 from groma.cli.shared.style import Style, aligned, is_terminal, paint, terminal_width, wrapped
 
@@ -50,6 +52,21 @@ class Console:
         """Print a warning on standard error unless --quiet."""
         if not self.quiet:
             warn(text)
+
+    def warn_of_all(self, texts: Sequence[str], most: int = 3) -> None:
+        """Print warnings; of more than ``most`` that differ in their numbers alone the first, and how many follow it.
+
+        A folder with one thing wrong in every file is told once, and the report for machines has all of them.
+        """
+        alike: dict[str, list[str]] = {}
+        for text in texts:
+            alike.setdefault(re.sub(r"\d+", "0", text), []).append(text)
+        for first, *others in alike.values():
+            if len(others) < most:
+                for text in (first, *others):
+                    self.warn(text)
+            else:
+                self.warn(f"{first} The same of {counted(len(others), 'others')}.")
 
     def wrote(self, *places: object) -> None:
         """Say that something was written, and where."""

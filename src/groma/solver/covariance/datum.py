@@ -85,10 +85,10 @@ def free_motions(layout: Layout, equations: NormalEquations, system: ReducedSyst
     held = [part[mask] for part, mask in zip(kept + landmarks, held_kept + held_landmarks, strict=True)]
     stuck = np.concatenate([np.zeros((0, 7)), *held])
     if len(stuck):
-        combinations = unmoved(stuck)
-    combinations = combinations[:, _not_still(kept + landmarks, combinations)]
+        combinations = unmoved(stuck, length)
+    gram, size = _costs(layout, equations, system, kept, landmarks)
+    combinations = combinations[:, moves_anything(size, combinations)]
     if combinations.shape[1]:
-        gram, size = _costs(layout, equations, system, kept, landmarks)
         gram = gram - _costs_of_incidences(layout.problem, motions)
         gram, size = (combinations.T @ M @ combinations for M in (gram, size))
         scale = 1.0 / np.sqrt(np.maximum(np.diag(size), 1e-300))
@@ -169,22 +169,27 @@ def _by_layout(layout: Layout, motions: dict[str, FloatArray]) -> tuple[list[Flo
     return kept, landmarks
 
 
-def unmoved(motions: FloatArray) -> FloatArray:
+def unmoved(motions: FloatArray, length: float) -> FloatArray:
     """Return the combinations (7, k) of motions (unknowns, 7) that leave all these unknowns where they are.
 
-    By singular values: their squares, the eigenvalues of the product, are lost in rounding below 1e-16.
+    An unknown is a length or an angle, so each is compared with itself: its row is made of unit length, unless it is
+    rounding beside ``length``, the unit of the translations. By singular values: their squares, the eigenvalues of the
+    product, are lost in rounding below 1e-16.
     """
-    _, values, vectors = np.linalg.svd(np.linalg.qr(motions, mode="r"))
+    norms = np.linalg.norm(motions, axis=1)
+    rows = motions / np.maximum(norms, RANK_TOLERANCE * min(1.0, length))[:, None]
+    _, values, vectors = np.linalg.svd(np.linalg.qr(rows, mode="r"))
     size = np.append(values, np.zeros(len(vectors) - len(values)))
     return vectors[size <= RANK_TOLERANCE * max(float(size.max(initial=0.0)), 1e-300)].T
 
 
-def _not_still(parts: list[FloatArray], combinations: FloatArray) -> BoolArray:
-    """Return which combinations move anything at all; a problem of directions alone has no translation."""
-    size = sum(
-        (np.abs(part @ combinations).max(axis=0, initial=0.0) for part in parts), np.zeros(combinations.shape[1])
-    )
-    return size > RANK_TOLERANCE
+def moves_anything(size: FloatArray, combinations: FloatArray) -> BoolArray:
+    """Return which combinations (7, k) move what is measured; a problem of directions alone has no translation.
+
+    ``size`` (7, 7) is what the motions would cost if every unknown moved alone: squares, and free of units.
+    """
+    costs = np.einsum("ik,ij,jk->k", combinations, size, combinations)
+    return costs > RANK_TOLERANCE**2 * np.diag(size).max(initial=0.0)
 
 
 def _costs_of_incidences(problem: Problem, motions: dict[str, FloatArray]) -> FloatArray:

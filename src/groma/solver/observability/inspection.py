@@ -21,7 +21,14 @@ from groma.problem.linearization import NormalEquations
 from groma.problem.problem import Problem
 from groma.problem.residuals import squared_norms
 from groma.problem.tied import Divided
-from groma.solver.covariance.datum import FREE_TOLERANCE, free_motions, held_coordinates, middle_and_extent, unmoved
+from groma.solver.covariance.datum import (
+    FREE_TOLERANCE,
+    free_motions,
+    held_coordinates,
+    middle_and_extent,
+    moves_anything,
+    unmoved,
+)
 from groma.solver.linear.blocks import multiply
 from groma.solver.linear.schur import ReducedSystem
 from groma.solver.linear.visible_motion import camera_centers, motion
@@ -66,13 +73,12 @@ class Inspection:
     def free_motions(self) -> tuple[FloatArray, FloatArray]:
         """World motions that cost nothing: combinations (7, k) of the seven, and their increments (unknowns, k)."""
         G, held = self._world_motions(), np.concatenate(self.held[0])
+        diagonal = np.concatenate([self.system.diagonal(c).reshape(-1) for c in range(len(self.layout.kept))])
         combinations = np.eye(7)
         if held.any():
-            combinations = unmoved(G[held])
-        still = np.abs(G @ combinations).max(axis=0, initial=0.0) <= 1e-9
-        combinations = combinations[:, ~still]
+            combinations = unmoved(G[held], self.place_and_size[1])
+        combinations = combinations[:, moves_anything(G.T @ (diagonal[:, None] * G), combinations)]
         if combinations.shape[1]:
-            diagonal = np.concatenate([self.system.diagonal(c).reshape(-1) for c in range(len(self.layout.kept))])
             M = np.where(diagonal[:, None] > 0.0, G @ combinations, 0.0)  # what nothing sees is not in the way
             cost = M.T @ np.stack([self._times(column) for column in M.T], axis=1)
             size = M.T @ (diagonal[:, None] * M)

@@ -108,7 +108,7 @@ def _datum(layout: Layout, size: FloatArray, G: FloatArray) -> Blocks:
     """
     datum = {(c, c): np.zeros((len(layout.blocks[c, c][0]), k.width, k.width)) for c, k in enumerate(layout.kept)}
     kinds = [layout.problem.variables[c.members[0].group].manifold.kind for c in layout.kept]
-    left = np.eye(G.shape[1])
+    G, left = G * size[:, None], np.eye(G.shape[1])  # in scaled unknowns, which have no unit
     for chosen in (("pose",), tuple(set(kinds) - {"pose"})):
         while left.shape[1]:
             moved = G @ left
@@ -126,8 +126,7 @@ def _datum(layout: Layout, size: FloatArray, G: FloatArray) -> Blocks:
             rows = slice(first, first + layout.kept[c].width)
             U, values, Vt = np.linalg.svd(moved[rows])
             rank = int((values > 1e-6 * values[0]).sum())
-            U = np.linalg.qr(U[:, :rank] / size[rows, None])[0]  # no motion along U, in scaled unknowns
-            datum[c, c][block] += U @ U.T
+            datum[c, c][block] += U[:, :rank] @ U[:, :rank].T  # no motion along U
             left = left @ Vt[rank:].T
     return datum
 
