@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """How fast the page of a report draws a large scene: milliseconds a frame, and for finding what a click hits.
 
-    python benchmarks/report_frames.py [--points 100000] [--lines 20000] [--canvas] [--json FILE]
+    python benchmarks/report_frames.py [--points 100000] [--lines 20000] [--windows 1400x1000 ...] [--canvas]
+
+For each size of the window: what a frame takes, how many draw calls and vertices it has, and what one triangle over the
+same number of pixels takes, which no page is faster than.
 
 Needs Playwright and Chromium. Without a graphics card, Chromium draws by the processor (SwiftShader), which this says:
 times of one machine cannot be compared with those of another.
@@ -52,6 +55,39 @@ MOTION = """async count => {
   }
   return [times, shares];
 }"""
+#: Draw calls of a whole frame and their vertices.
+CALLS = """() => {
+  const gl = canvas.getContext("webgl2"), found = { calls: 0, vertices: 0 };
+  const arrays = gl.drawArrays, elements = gl.drawElements;
+  const count = vertices => { found.calls++; found.vertices += vertices; };
+  gl.drawArrays = (...given) => { count(given[2]); arrays.apply(gl, given); };
+  gl.drawElements = (...given) => { count(given[1]); elements.apply(gl, given); };
+  paint(); renderer.finish();
+  delete gl.drawArrays; delete gl.drawElements;
+  return found;
+}"""
+#: One triangle over a whole canvas, drawn and waited for.
+TRIANGLE = """([width, height, count]) => {
+  const canvas = document.createElement("canvas");
+  canvas.width = width; canvas.height = height; document.body.append(canvas);
+  const gl = canvas.getContext("webgl2"), program = gl.createProgram(), pixel = new Uint8Array(4), times = [];
+  const vertex = `#version 300 es
+    void main() { gl_Position = vec4(gl_VertexID == 1 ? 3 : -1, gl_VertexID == 2 ? 3 : -1, 0, 1); }`;
+  const colour = `#version 300 es
+    precision mediump float; out vec4 c; void main() { c = vec4(0.2, 0.4, 0.6, 1); }`;
+  for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, colour]]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, text); gl.compileShader(shader); gl.attachShader(program, shader);
+  }
+  gl.linkProgram(program); gl.useProgram(program); gl.viewport(0, 0, width, height);
+  for (let i = 0; i < count; i++) {
+    const begin = performance.now();
+    gl.clear(gl.COLOR_BUFFER_BIT); gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
+    times.push(performance.now() - begin);
+  }
+  return [times, [...pixel], gl.getError()];
+}"""
 HITS = """count => {
   const times = [];
   for (let i = 0; i < count; i++) {
@@ -99,6 +135,12 @@ def measure(page: Path, canvas: bool, size: tuple[int, int]) -> dict[str, object
         frames, own, hits = view.evaluate(FRAMES, 20), view.evaluate(OWN, 40), view.evaluate(HITS, 30)
         pixels = view.evaluate("[canvas.width, canvas.height]")
         found = {"drawn_by": view.evaluate("renderer.name"), "graphics": view.evaluate(CARD) if not canvas else "none"}
+        if not canvas:
+            found.update(view.evaluate(CALLS))
+            triangle, colour, error = browser.new_page().evaluate(TRIANGLE, [*pixels, 20])
+            if error or colour != [51, 102, 153, 255]:
+                raise RuntimeError(f"The triangle was not drawn: pixel {colour}, error {error}.")
+            found["triangle_ms"] = statistics.median(triangle)
         browser.close()
     moving = {"moving_ms": statistics.median(times[30:]), "moving_share": statistics.median(shares[30:])}
     return {
@@ -106,6 +148,7 @@ def measure(page: Path, canvas: bool, size: tuple[int, int]) -> dict[str, object
         "pixels": pixels,
         **moving,
         "whole_frame_ms": statistics.median(frames),
+        "least_frame_ms": min(frames),
         "own_ms": statistics.median(own),
         "hit_ms": statistics.median(hits),
     }
@@ -117,12 +160,15 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=100_000)
     parser.add_argument("--lines", type=int, default=20_000)
     parser.add_argument("--canvas", action="store_true", help="without WebGL")
+    parser.add_argument("--windows", nargs="+", default=["1400x1000"], metavar="WxH", help="pixels of the window")
     parser.add_argument("--json", type=Path)
     wanted = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         page = Path(folder) / "page.html"
         write_report(page, None, city(wanted.points, wanted.lines), title="A synthetic city")
-        found = {"bytes": page.stat().st_size, **measure(page, wanted.canvas, (1400, 1000))}
+        sizes = [tuple(map(int, size.split("x"))) for size in wanted.windows]
+        rows = [measure(page, wanted.canvas, (width, height)) for width, height in sizes]
+        found = {"bytes": page.stat().st_size, "windows": rows}
     text = json.dumps(found, indent=1)
     sys.stdout.write(text + "\n")
     if wanted.json is not None:

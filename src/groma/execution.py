@@ -33,8 +33,12 @@ _Result = TypeVar("_Result")
 
 #: Pieces of work that wait for each worker; more would only take memory.
 _WAITING = 2
-#: What glibc's ``mallopt`` calls the number of places that memory is taken from (the format of the call).
-_M_ARENA_MAX = -8
+#: What glibc's ``mallopt`` calls the number of places that memory is taken from, the bytes from which on something has
+#: pages of its own, and the free bytes at the end that are kept (the format of the call).
+_M_ARENA_MAX, _M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD = -8, -3, -1
+#: glibc's largest own value of the former, and more than the work on some photographs frees (cost: memory, which later
+#: work takes again).
+_PAGES_OF_ITS_OWN, _KEPT = 32 * 2**20, 256 * 2**20
 #: Calls to an executor of processes that each of its workers gets, so that all end at about the same time (cost: of
 #: waiting for the last).
 _CALLS = 4
@@ -73,13 +77,23 @@ def available_cores() -> int:
 
 
 def share_memory() -> None:
-    """Let all threads of this process take memory from one place, where the system's library is glibc.
+    """Let all threads of this process take memory from one place, and keep it, where the system's library is glibc.
 
-    Otherwise what a thread gives back is kept for that thread, and two of them hold a quarter more than one.
+    Otherwise what a thread gives back is kept for that thread, and two of them hold a quarter more than one; and the
+    room for a photograph is given back to the system after each, which then hands out, and clears, new pages for the
+    next. Other threads wait for that. What the environment says about it (``MALLOC_...``) is left as it is.
     """
-    if sys.platform == "linux" and "MALLOC_ARENA_MAX" not in os.environ:
-        with suppress(OSError, AttributeError):
-            ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 1)
+    if sys.platform != "linux":
+        return
+    wanted = (
+        ("MALLOC_ARENA_MAX", _M_ARENA_MAX, 1),
+        ("MALLOC_MMAP_THRESHOLD_", _M_MMAP_THRESHOLD, _PAGES_OF_ITS_OWN),
+        ("MALLOC_TRIM_THRESHOLD_", _M_TRIM_THRESHOLD, _KEPT),
+    )
+    with suppress(OSError, AttributeError):
+        for name, parameter, value in wanted:
+            if name not in os.environ:
+                ctypes.CDLL(None).mallopt(parameter, value)
 
 
 @contextmanager
@@ -195,6 +209,13 @@ def map_in_threads(function: Callable[[_Item], _Result], items: Sequence[_Item])
 def together(*functions: Callable[[], Any]) -> tuple[Any, ...]:
     """Return what some functions return, which are called in threads of this process."""
     return tuple(map_in_threads(_called, functions))
+
+
+def begun(function: Callable[[], _Result]) -> Callable[[], _Result]:
+    """Begin a call in a thread of this process, and return what waits for its result; without workers that calls it."""
+    crew = _CREW.get()
+    executor = None if crew is None else crew.here.executor
+    return function if executor is None else executor.submit(function).result
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from groma.errors import InputError, ShapeError
 from groma.estimators.association import inlier_probability
 from groma.estimators.plane_fit import fit_plane, tilt_sigma
 from groma.estimators.plane_search import PlaneOptions, find_planes
+from groma.execution import work_with
 
 SIGMA = 0.01
 
@@ -133,6 +134,20 @@ def test_many_planes_are_found():
     patches = [wall(rng, 40, 2, rng.uniform(0, 30), size=2.0, shift=(4.0 * i, 4.0 * j)) for i, j in np.ndindex(11, 11)]
     points = np.concatenate(patches)
     assert 118 <= len(find_planes(points, noise_of(points))) <= 121
+
+
+@pytest.mark.kernels
+def test_the_same_planes_with_any_number_of_threads():
+    """Bit by bit, though more candidates are grown than one after the other would be, and others are thrown away."""
+    points, segments = room(np.random.default_rng(11))
+    noise = np.broadcast_to(SIGMA**2 * np.eye(3), (len(segments), 2, 3, 3))
+    alone = find_planes(points, noise_of(points), segments, noise)
+    assert len(alone) > 10
+    for threads in (2, 5):
+        with work_with(threads):
+            found = find_planes(points, noise_of(points), segments, noise)
+        for name in ("planes", "covariance", "support", "point_label", "segment_label"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
 
 
 def test_segments_make_planes_too():

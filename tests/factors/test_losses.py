@@ -101,6 +101,11 @@ def test_kernel_and_method_agree_and_shape_is_kept():
     assert loss_value(member.tag, member.parameters, s[1, 1]) == value[1, 1]
 
 
+def test_scaled_bends_at_so_many_times_the_scale():
+    assert Cauchy(2.0).scaled(0.5) == Cauchy(1.0)
+    assert Trivial().scaled(0.5) == Trivial()
+
+
 def test_by_name():
     assert loss("huber", 1.5) == Huber(1.5)
     assert loss("soft-l1") == SoftL1(1.0)

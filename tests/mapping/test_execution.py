@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from _wireframe import arc, random_lines, wireframe
 
-from groma.execution import available_cores, beside, map_ranges, map_work, num_workers, work_with
+from groma.execution import available_cores, begun, beside, map_ranges, map_work, num_workers, work_with
 from groma.mapping.lines.build import MapLinesOptions, map_lines
 
 
@@ -168,6 +168,27 @@ if __name__ == "__main__":
         print(number, "workers agree")
 
 
+@pytest.mark.parametrize("threads", [1, 2])
+def test_what_was_begun_is_waited_for(threads):
+    """The result, and what was raised, whoever did it; with threads the caller goes on meanwhile."""
+    caller, others, may_end = threading.current_thread(), [], threading.Event()
+
+    def work():
+        others.append(threading.current_thread() is not caller)
+        return may_end.wait(10.0)
+
+    def fails():
+        raise KeyError("inside")
+
+    with work_with(threads):
+        result, failed = begun(work), begun(fails)
+        may_end.set()
+        assert result()
+        with pytest.raises(KeyError, match="inside"):
+            failed()
+    assert others == [threads > 1]
+
+
 ARENAS = """
 import ctypes, sys, threading
 from groma.execution import share_memory
@@ -203,3 +224,39 @@ def test_threads_take_memory_from_one_place(tmp_path):
 
     assert arenas("shared") == 1
     assert arenas("apart") > 1
+
+
+ROOM = """
+import ctypes, resource, sys
+from groma.execution import share_memory
+if sys.argv[1] == "kept":
+    share_memory()
+libc = ctypes.CDLL(None)
+libc.malloc.restype, libc.free.argtypes = ctypes.c_void_p, (ctypes.c_void_p,)
+def use():
+    blocks = [libc.malloc(2**20) for _ in range(64)]
+    for block in blocks:
+        ctypes.memset(block, 1, 2**20)
+    for block in blocks:
+        libc.free(block)
+use()
+use()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+use()
+print((resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before) * resource.getpagesize())
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a matter of glibc")
+def test_memory_is_kept_for_the_next_photograph():
+    """The bytes of new pages that the same 64 MiB need when they are taken for the third time."""
+    if not hasattr(ctypes.CDLL(None), "malloc_info"):
+        pytest.skip("not glibc")
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")}
+
+    def new_bytes(how):
+        call = [sys.executable, "-c", ROOM, how]
+        return int(subprocess.run(call, capture_output=True, text=True, check=True, env=environment).stdout)
+
+    assert new_bytes("kept") < 2**20  # one of the 64 blocks
+    assert new_bytes("given back") > 32 * 2**20  # half of them

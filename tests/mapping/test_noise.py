@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Noise from residuals: its size, noise of one size left alone, points whose noise differs told apart.
 
-And segments: how the errors of their ends are correlated, and that lines are measured where they are independent.
+And segments: how the errors of their ends are correlated, that lines are measured where they are independent, and where
+the loss that fits their errors bends.
 And by how much an adjustment moves what the images see.
 """
 
@@ -15,7 +16,7 @@ from groma.errors import InputError
 from groma.evaluation import evaluate_poses
 from groma.geometry import quaternion
 from groma.mapping.noise.landmarks import point_noise
-from groma.mapping.noise.observations import line_end_correlation, moved_px, noise_px, with_point_noise
+from groma.mapping.noise.observations import line_bend, line_end_correlation, moved_px, noise_px, with_point_noise
 from groma.problem.residuals import residuals_of
 from groma.scene import PointDepths, Relations, Similarity, synthetic
 
@@ -105,8 +106,11 @@ def test_scenes_that_tell_nothing_are_returned():
     assert with_point_noise(small) is small
 
 
-def lines_with(correlation, seed=0, num_images=30):
-    """A scene of lines whose segments have ends with correlated noise, as fits to the pixels of an edge do."""
+def lines_with(correlation, seed=0, num_images=30, freedom=np.inf):
+    """A scene of lines whose segments have ends with correlated noise, as fits to the pixels of an edge do.
+
+    With degrees of freedom it follows Student's distribution.
+    """
     made = synthetic.holistic(num_images, noise_px=0.0, seed=seed)
     truth, rng = made.truth.replace(relations=Relations()), np.random.default_rng(seed)
     table = truth.line_observations
@@ -114,6 +118,8 @@ def lines_with(correlation, seed=0, num_images=30):
     normal = (second - first)[:, ::-1] * [-1.0, 1.0]
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     shift, turn = rng.normal(size=(2, len(table), 1)) * NOISE
+    if np.isfinite(freedom):
+        shift, turn = np.array([shift, turn]) / np.sqrt(rng.chisquare(freedom, (len(table), 1)) / freedom)
     shift, turn = shift * np.sqrt((1 + correlation) / 2), turn * np.sqrt((1 - correlation) / 2)
     noisy = np.hstack([first + (shift - turn) * normal, second + (shift + turn) * normal])
     start = made.start.replace(relations=Relations(), line_observations=table.replace(segment=noisy))
@@ -128,6 +134,27 @@ def test_correlation_of_the_ends_of_segments_and_its_noise(correlation):
     found = line_end_correlation(scene)
     assert found == pytest.approx(correlation, abs=0.15)
     assert noise_px(scene, "lines", found) == pytest.approx(NOISE, rel=0.15)
+
+
+@pytest.mark.parametrize("freedom", [1.5, 3.0, 8.0])
+def test_a_loss_of_segments_bends_where_their_errors_do(freedom):
+    """The scale of Student's distribution, in deviations that the median tells; of normal noise it is far out."""
+    truth, start = lines_with(-0.5, num_images=60, freedom=freedom)
+    exact = truth.replace(line_observations=start.line_observations)
+    median = 2.0 * np.log(2.0)
+    expected = np.sqrt(median / (2.0 ** (2.0 / freedom) - 1.0))
+    # Of n squares the bend is known to about 1 / sqrt(n) in the mean, here 3 %, and to twice that at 8.
+    assert line_bend(exact, -0.5) == pytest.approx(expected, rel=0.2)
+
+
+def test_a_loss_of_normal_segments_hardly_bends():
+    truth, start = lines_with(-0.5, num_images=60)
+    assert line_bend(truth.replace(line_observations=start.line_observations), -0.5) > 4.0
+
+
+def test_few_segments_tell_no_bend():
+    assert line_bend(lines_with(-0.5, num_images=6)[1]) == np.inf
+    assert line_bend(scene_with(varied)[1].points_only()) == np.inf
 
 
 @pytest.mark.parametrize("correlation", [-0.5, 0.5])

@@ -64,6 +64,8 @@ class AdjustOptions:
     #: Where the loss begins to bend, in standard deviations (pixels by default); None takes 1, and 2 in the second
     #: stage of ``auto``.
     loss_scale: float | None = None
+    #: The scale of the loss of segments over that of points, whose residuals may have other tails.
+    line_loss_factor: float = 1.0
     #: Move the cameras; False adjusts the landmarks alone.
     refine_poses: bool = True
     #: Change the model of all cameras first, to one that can hold them: PINHOLE to OPENCV, for example. The parameters
@@ -121,9 +123,10 @@ class AdjustOptions:
     threads: int | None = None
 
     def __post_init__(self) -> None:
-        for name in ("point_sigma_px", "line_sigma_px", "structure_sigma_px"):
+        for name in ("point_sigma_px", "line_sigma_px", "structure_sigma_px", "line_loss_factor"):
             if not 0.0 < getattr(self, name) < float("inf"):
-                raise InputError(f"{name} must be a positive number of pixels; got {getattr(self, name)}.")
+                unit = " of pixels" if name.endswith("_px") else ""
+                raise InputError(f"{name} must be a positive number{unit}; got {getattr(self, name)}.")
 
 
 def adjust(
@@ -228,7 +231,7 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
 
         if last and number:
             loss = stages[number] = _wide_enough(loss, replace(assembly, problem=problem))
-        solution = solve(with_loss(problem, loss, relation_loss), solver_options, tell)
+        solution = solve(with_loss(problem, loss, relation_loss, options.line_loss_factor), solver_options, tell)
         problem = solution.problem
         reports.append(solution.report)
         if stopped:
@@ -241,7 +244,7 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
             moved.append(renewed)
             if last and problem is not solution.problem:
                 reports[-1] = with_costs_at(reports[-1], problem)
-    report = combined(reports, assembly.problem, stages)
+    report = combined(reports, assembly.problem, stages, options.line_loss_factor)
     adjusted, relations = drop_failed_relations(disassemble(scene, problem), problem)
     if any(map(len, moved)):
         adjusted = with_seen_ends(adjusted, np.unique(np.concatenate(moved)))

@@ -93,6 +93,8 @@ class AssemblyOptions:
     meeting_lines: bool = False
     #: Loss of what comes from matching, and of the relations between landmarks.
     loss: Loss = field(default_factory=Trivial)
+    #: The scale of the loss of segments over that of points.
+    line_loss_factor: float = 1.0
     #: Another loss of the relations between landmarks.
     relation_loss: Loss | None = None
     #: Leave out points that start behind their camera.

@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+from groma.adjustment.terms.lines import LINE_FACTORS
 from groma.adjustment.terms.relations import RELATION_FACTORS
 from groma.factors.contract import Factor
 from groma.factors.losses import Cauchy, Loss
@@ -58,17 +59,23 @@ def keeps_loss(factor: Factor) -> bool:
     return factor.type_name in OWN_LOSS or any(ref.group == "control_points" for _, ref in factor.references())
 
 
-def with_loss(problem: Problem, loss: Loss, relation_loss: Loss | None = None) -> Problem:
+def with_loss(
+    problem: Problem, loss: Loss, relation_loss: Loss | None = None, line_loss_factor: float = 1.0
+) -> Problem:
     """Return a problem under a loss; priors keep theirs.
 
-    Relations between landmarks have a noise of their own, and a given loss or the plain scale.
+    Relations between landmarks have a noise of their own, and a given loss or the plain scale. Segments have the same
+    loss as points, bent at so many times its scale.
     """
     if relation_loss is None:
         relation_loss = make_loss(loss.name, RELATION_SCALES[loss.name]) if loss.name in RELATION_SCALES else loss
+    line_loss = loss.scaled(line_loss_factor)
 
     def of(factor: Factor) -> Loss:
         if keeps_loss(factor):
             return factor.loss
+        if factor.type_name in LINE_FACTORS:
+            return line_loss
         return relation_loss if factor.type_name in RELATION_FACTORS else loss
 
     return problem.with_losses([of(factor) for factor in problem.factors])
@@ -83,14 +90,17 @@ def stage_entries(stages: list[Loss], reports: list[SolveReport]) -> tuple[dict[
     return tuple(entries)
 
 
-def combined(reports: list[SolveReport], start: Problem, stages: list[Loss]) -> SolveReport:
+def combined(
+    reports: list[SolveReport], start: Problem, stages: list[Loss], line_loss_factor: float = 1.0
+) -> SolveReport:
     """Return one report of all stages: costs under the last loss, times and steps summed."""
     last = reports[-1]
     if len(reports) == 1:
         return last
     loss, first = stages[len(reports) - 1], reports[0]
     if loss != stages[0]:
-        first = solve(with_loss(start, loss), SolverOptions(max_iterations=0)).report
+        at_start = with_loss(start, loss, line_loss_factor=line_loss_factor)
+        first = solve(at_start, SolverOptions(max_iterations=0)).report
     return replace(one_after_another(reports), initial_cost=first.initial_cost, initial_costs=first.initial_costs)
 
 

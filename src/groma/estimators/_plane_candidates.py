@@ -23,8 +23,8 @@ from groma.geometry.algebra import dot, norm
 
 #: Pairs looked at together (cost: memory).
 _CHUNK = 4096
-#: Candidates that are worth a thread (cost: time only).
-_SCORED_AT_ONCE = 8
+#: Candidates that are worth a thread, and pieces for each, as some take longer than others (cost: time only).
+_SCORED_AT_ONCE, _PIECES = 8, 8
 
 
 @dataclass(frozen=True)
@@ -275,19 +275,23 @@ class Scores:
     def of(self, which: IntArray, labels: IntArray) -> tuple[IntArray, FloatArray]:
         """Support (M,) and score (M,) of some candidates among the features without a label."""
         features, support, score = self._features, np.empty(len(which), np.int64), np.empty(len(which))
-        pieces = max(1, min(num_threads(), len(which) // _SCORED_AT_ONCE))
+        threads = num_threads()
+        pieces = max(1, min(_PIECES * threads if threads > 1 else 1, len(which) // _SCORED_AT_ONCE))
         cuts = [len(which) * piece // pieces for piece in range(pieces + 1)]
-        while len(self._rooms) < pieces:
-            self._rooms.append(_Room(len(features.places)))
 
         def fill(piece: int) -> None:
-            room, part = self._rooms[piece], slice(cuts[piece], cuts[piece + 1])
+            part = slice(cuts[piece], cuts[piece + 1])
+            try:
+                room = self._rooms.pop()  # nobody else's until it is put back
+            except IndexError:
+                room = _Room(len(features.places))
             scores_loop(
                 features.places, features.packed, features.spacing, features.partner, features.neighbours, labels,
                 self._gate, self._reach, self._planes, self._homes, which[part], room.stamp, room.number, room.queue,
                 support[part], score[part],
             )  # fmt: skip
             room.number += part.stop - part.start
+            self._rooms.append(room)
 
         map_in_threads(fill, range(pieces))
         return support, score

@@ -32,7 +32,7 @@ S. Liu et al., *3D Line Mapping Revisited*, CVPR 2023, section 4.1 (R_tau, P_tau
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -41,7 +41,7 @@ from groma._trees import kd_tree
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
 from groma.evaluation.gates import SCORES
-from groma.evaluation.poses import evaluate_poses
+from groma.evaluation.poses import as_numbers, evaluate_poses
 from groma.geometry.algebra import finite_rows
 from groma.io.geometry import Geometry
 from groma.scene import Scene
@@ -77,11 +77,7 @@ class LineScores:
 
     def to_dict(self) -> dict[str, object]:
         """Return the scores for a machine-readable report."""
-        result: dict[str, object] = {}
-        for item in fields(self):
-            value = getattr(self, item.name)
-            result[item.name] = {f"{tau:g}": v for tau, v in value.items()} if isinstance(value, dict) else value
-        return result
+        return as_numbers(self)
 
 
 def score_lines(

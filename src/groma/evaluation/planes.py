@@ -24,6 +24,7 @@ from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.evaluation.gates import SCORES
 from groma.evaluation.lines import threshold_list
+from groma.evaluation.poses import as_numbers
 from groma.geometry.algebra import finite_rows
 from groma.scene import Scene
 
@@ -55,10 +56,7 @@ class PlaneScores:
 
     def to_dict(self) -> dict[str, object]:
         """Return the scores for a machine-readable report."""
-        names = ("precision", "recall", "normal_deg_mean", "normal_deg_median", "normal_deg_max")
-        names += ("offset_mean", "offset_median", "offset_max", "num_planes", "num_reference")
-        result: dict[str, object] = {name: getattr(self, name) for name in names}
-        return {**result, "num_matches": len(self.matches)}
+        return as_numbers(self, "matches") | {"num_matches": len(self.matches)}
 
 
 @dataclass(frozen=True)
@@ -75,12 +73,7 @@ class PointPlaneScores:
 
     def to_dict(self) -> dict[str, object]:
         """Return the scores for a machine-readable report."""
-        return {
-            "inlier_share": {f"{tau:g}": value for tau, value in self.inlier_share.items()},
-            "inlier_rmse": {f"{tau:g}": value for tau, value in self.inlier_rmse.items()},
-            "num_points": self.num_points,
-            "num_planes": self.num_planes,
-        }
+        return as_numbers(self)
 
 
 def match_planes(

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -44,16 +45,18 @@ class PoseScores:
 
     def to_dict(self) -> dict[str, object]:
         """Return the scores for a machine-readable report."""
-        return {
-            "center_rmse": self.center_rmse,
-            "center_max": self.center_max,
-            "rotation_deg_mean": self.rotation_deg_mean,
-            "rotation_deg_max": self.rotation_deg_max,
-            "auc": {f"{degrees:g}": value for degrees, value in self.auc.items()},
-            "num_images": self.num_images,
-            "num_missing": self.num_missing,
-            "warnings": list(self.warnings),
-        }
+        return as_numbers(self, "alignment")
+
+
+def as_numbers(scores: Any, *left_out: str) -> dict[str, object]:
+    """Return the fields of scores for a machine-readable report, without some; thresholds are written out."""
+    result = {item.name: getattr(scores, item.name) for item in fields(scores) if item.name not in left_out}
+    for name, value in result.items():
+        if isinstance(value, dict):
+            result[name] = {f"{threshold:g}": number for threshold, number in value.items()}
+        elif isinstance(value, tuple):
+            result[name] = list(value)
+    return result
 
 
 def evaluate_poses(estimate: Scene, reference: Scene, with_scale: bool = True) -> PoseScores:

@@ -36,7 +36,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, fields, replace
 from types import MappingProxyType
 from typing import Any, ClassVar, TypeVar
 
@@ -192,6 +192,11 @@ class Loss:
     def parameters(self) -> tuple[float, ...]:
         """The values of the fields, in their order, as the kernel takes them."""
         return tuple(float(value) for value in astuple(self))
+
+    def scaled(self, factor: float) -> Loss:
+        """Return the loss that bends at so many times the scale; one without a scale stays as it is."""
+        scale = getattr(self, "scale", None)
+        return self if scale is None or factor == 1.0 else replace(self, scale=factor * scale)  # type: ignore[call-arg]
 
     def evaluate(self, squared_norm: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return rho, rho' and rho'' at the squared whitened norms ``squared_norm`` (...)."""

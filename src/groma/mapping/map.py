@@ -32,7 +32,7 @@ from groma._version import __version__
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult
 from groma.adjustment.survey.given import Survey
-from groma.execution import work_with
+from groma.execution import together, work_with
 from groma.features.contract import ImageRetrieval, SegmentDetector, SegmentMatcher
 from groma.features.external import ExternalMatches
 from groma.features.matches import LineMatches
@@ -52,7 +52,7 @@ from groma.mapping.lines.confidence import DEFAULT_CONFIDENCE
 from groma.mapping.lines.hypotheses.earlier import EarlierMap
 from groma.mapping.lines.in_views import map_lines_in_views
 from groma.mapping.lines.options import MIN_LENGTH
-from groma.mapping.noise.observations import line_end_correlation, moved_px, noise_px, with_point_noise
+from groma.mapping.noise.observations import line_bend, line_end_correlation, moved_px, noise_px, with_point_noise
 from groma.mapping.noise.shared import with_shared_noise
 from groma.mapping.photographs import check_images, check_number, image_files, image_reader, images_left_out
 from groma.mapping.read_rows import adjust_read_rows, mapped_as_measured, read_by_rows, taken_at_once
@@ -268,8 +268,7 @@ def map_segments(
     No file of an image is read; ``start`` of the result is ``points``. ``depths`` are those of the segments, as
     :func:`~groma.mapping.depth.segments.segment_depths` returns them.
     """
-    options = stages.options
-    scene = with_point_noise(points)
+    options, scene = stages.options, with_point_noise(points)
     line_map = stages.run(find_lines, scene, segments, matches, neighbors, None)
     scene = with_line_depths(line_map.add_to(scene, segments), line_map, segments, depths)
     weighted = _weighted(scene, options)
@@ -287,14 +286,19 @@ def map_segments(
         if scene.num_lines == 0 or moved_px(before, joint, GATES.moved_share) <= options.lines.noise:
             break
     if scene.num_lines:
-        weighted = dataclasses.replace(weighted, loss="cauchy", loss_scale=GATES.last_loss_scale)
+        bend = math.inf if options.refine_poses else line_bend(scene, weighted.line_end_correlation)
+        tails = {"loss_scale": GATES.last_loss_scale, "line_loss_factor": min(bend / GATES.last_loss_scale, 1.0)}
+        weighted = dataclasses.replace(weighted, loss="cauchy", **tails)
+    sigma_px = weighted.point_sigma_px, weighted.line_sigma_px * math.sqrt(1.0 + weighted.line_end_correlation)
     if options.find_planes:
         scene = stages.run(find_planes, scene)
-        weighted = dataclasses.replace(weighted, structure_sigma_px=surface_noise_px(scene, options.structure))
-    independent = math.sqrt(1.0 + weighted.line_end_correlation)
-    scene = with_shared_noise(scene, weighted.point_sigma_px, weighted.line_sigma_px * independent)
+        of_planes = partial(surface_noise_px, scene, options.structure)
+        scene, surface_px = together(partial(with_shared_noise, scene, *sigma_px), of_planes)
+        weighted = dataclasses.replace(weighted, structure_sigma_px=surface_px)
+    else:
+        scene = with_shared_noise(scene, *sigma_px)
     adjusted = stages.run(adjust_everything, scene, weighted)
-    return result_of(points, scene, adjusted, weighted, line_map, options.min_confidence)
+    return result_of(points, scene, adjusted, weighted, line_map, options.min_confidence, not options.refine_poses)
 
 
 # --------------------------------------------------------------------------------------------------------------- stages

@@ -29,7 +29,7 @@ from groma.execution import beside
 from groma.factors.losses import GemanMcClure, Loss, loss
 from groma.io import atomic_output, write_geometry, write_scene
 from groma.mapping.depth.points import MeasuredDepths
-from groma.mapping.lines.confidence import left_out, with_confidence
+from groma.mapping.lines.confidence import left_out, line_confidence
 from groma.mapping.lines.intervals import with_supported_intervals
 from groma.mapping.lines.line_map import LineMap, explain
 from groma.mapping.surveyed import survey_numbers
@@ -212,7 +212,7 @@ def _problem_of(scene: Scene, told: AdjustOptions) -> Problem:
         refine_intrinsics=bool(told.refine_intrinsics),
     )
     problem, ended_with = assemble(scene, assembly).problem, last_loss(told)
-    return with_loss(problem, ended_with)
+    return with_loss(problem, ended_with, line_loss_factor=told.line_loss_factor)
 
 
 def last_loss(told: AdjustOptions) -> Loss:
@@ -229,11 +229,16 @@ def result_of(
     weighted: AdjustOptions,
     line_map: LineMap,
     min_confidence: float,
+    held: bool,
 ) -> MapResult:
-    """Return the result of a map from its last adjustment, with the lines that are probably right."""
-    scene = with_confidence(with_supported_intervals(adjusted.scene))
+    """Return the result of a map from its last adjustment, with the lines that are probably right.
+
+    Where poses were held, lines as mapped tell best what their segments say: none has given way to a plane yet.
+    """
+    scene = with_supported_intervals(adjusted.scene)
     before = before.replace(line_intervals=scene.line_intervals)
-    kept = scene.lines.confidence >= min_confidence
+    confidence = line_confidence(before if held else scene)
+    scene, kept = scene.replace(lines=scene.lines.replace(confidence=confidence)), confidence >= min_confidence
     scene, before = without_unused(scene.keep(lines=kept), before.keep(lines=kept))
     missing = [] if line_map.num_lines else ["No line was mapped; see what became of the segments."]
     return MapResult(

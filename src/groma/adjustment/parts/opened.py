@@ -96,7 +96,7 @@ class OpenParts:
         }
         problem = Problem(variables, made.problem.factors)
         if loss is not None:
-            problem = with_loss(problem, loss, self.options.relation_loss)
+            problem = with_loss(problem, loss, self.options.relation_loss, self.options.line_loss_factor)
         return scene, replace(made, problem=problem)
 
     def states_of(self, part: Part, states: States) -> States:

@@ -71,6 +71,11 @@ class Draft:
     notes: list[str]
 
     @property
+    def line_loss(self) -> Loss:
+        """Loss of segments."""
+        return self.options.loss.scaled(self.options.line_loss_factor)
+
+    @property
     def relation_loss(self) -> Loss:
         """Loss of relations between landmarks."""
         return self.options.relation_loss or self.options.loss

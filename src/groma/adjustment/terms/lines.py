@@ -44,6 +44,8 @@ from groma.geometry.algebra import unit
 #: Segments for which the sine of the angle between their line and the ray to its anchor is smaller are left out of
 #: ``normal``: both parts of the residual then say the same.
 MIN_SINE = 1e-3
+#: Types of the factors of segments.
+LINE_FACTORS = ("line_reprojection", "line_bearing", "line_normal")
 
 
 def line_sigma_px(draft: Draft) -> FloatArray:
@@ -64,7 +66,7 @@ def _factors(draft: Draft) -> Iterator[Group]:
                 intrinsics=intrinsics,
                 segments=np.hstack(places),
                 sqrt_information=1.0 / sigma[rows],
-                loss=options.loss,
+                loss=draft.line_loss,
                 **draft.camera_refs(table.image_idx[rows]),
                 **line_refs(draft, name, table.image_idx[rows], lines[table.line_idx[rows]], places),
             )
@@ -115,7 +117,7 @@ def _sines(draft: Draft, rays: _Rays, sigma: FloatArray) -> Group:
         start_bearings=rays.first,
         end_bearings=rays.second,
         sqrt_information=pixels / (sigma[:, None, None] if both else sigma),
-        loss=draft.options.loss,
+        loss=draft.line_loss,
         **draft.camera_refs(table.image_idx[rays.rows]),
         **line_refs(draft, rays.model, table.image_idx[rays.rows], lines[table.line_idx[rays.rows]], places),
     )
@@ -151,7 +153,7 @@ def _normals(draft: Draft, rays: _Rays, sigma: FloatArray) -> Group:
         line=Ref("lines", table.line_idx[rows]),
         normals=normal[good],
         sqrt_information=ends_of_residual / sigma[good, None, None],
-        loss=draft.options.loss,
+        loss=draft.line_loss,
         **draft.camera_refs(table.image_idx[rows]),
     )
     return Group(factor, observes="lines", pixels_of_residual=ends_of_residual)

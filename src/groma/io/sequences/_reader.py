@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -88,45 +88,40 @@ class Preparation:
     register: Callable[[npt.NDArray[np.float32]], npt.NDArray[np.float32]] | None = None
 
 
+@dataclass(eq=False)
 class FileSequence:
     """A :class:`~groma.io.sequences.frame.Sequence` of image files."""
 
-    def __init__(
-        self,
-        kind: Kind,
-        entries: list[Entry],
-        camera: SequenceCamera,
-        preparation: Preparation,
-        file_size: tuple[int, int],
-        reference: Trajectory | None,
-        warnings: list[str],
-    ) -> None:
-        self.kind: Kind = kind
-        self.camera = camera
-        self.reference = reference
-        self.warnings = warnings
-        self.num_frames: int | None = len(entries)
-        self._entries = entries
-        self._preparation = preparation
-        self._file_size = file_size
+    kind: Kind
+    entries: list[Entry]
+    camera: SequenceCamera
+    preparation: Preparation
+    #: Width and height of the images in the files.
+    file_size: tuple[int, int]
+    reference: Trajectory | None
+    warnings: list[str]
+    num_frames: int | None = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.num_frames = len(self.entries)
 
     def __len__(self) -> int:
-        return len(self._entries)
+        return len(self.entries)
 
     @property
     def pictures(self) -> dict[str, Path]:
         """The files of frames by name; empty where frames are rectified, so that no file shows what was tracked."""
-        return {} if self._preparation.gray is not None else {entry.gray.name: entry.gray for entry in self._entries}
+        return {} if self.preparation.gray is not None else {entry.gray.name: entry.gray for entry in self.entries}
 
     def __iter__(self) -> Iterator[Frame]:
-        for frame, remarks in read_ahead(self._load, self._entries):
+        for frame, remarks in read_ahead(self._load, self.entries):
             self.warnings.extend(remark for remark in remarks if remark not in self.warnings)
             if frame is not None:
                 yield frame
 
     def _load(self, entry: Entry) -> tuple[Frame | None, list[str]]:
         remarks: list[str] = []
-        preparation, width, height = self._preparation, *self._file_size
+        preparation, width, height = self.preparation, *self.file_size
         gray = _image(entry.gray, (height, width), remarks, "the frame is skipped")
         if gray is None:
             return None, remarks
@@ -152,7 +147,7 @@ class FileSequence:
         except FileFormatError as error:
             remarks.append(f"{path.name}: {error}")
             return None
-        width, height = self._file_size
+        width, height = self.file_size
         if raw is None or raw.ndim != 2 or raw.shape != (height, width):
             what = "cannot be read" if raw is None else f"is {raw.shape[1]}x{raw.shape[0]}, not {width}x{height} grey"
             remarks.append(f"{path.name} {what}; the frame comes without.")
@@ -160,14 +155,14 @@ class FileSequence:
         if raw.dtype == np.uint8:  # a picture of depths; distances in so few steps would be taken for exact
             remarks.append(f"{path.name} has 8 bits, too few for distances (16 or floats); the frame comes without.")
             return None
-        depth = raw.astype(np.float32) * np.float32(1.0 / self._preparation.depth_scale)
+        depth = raw.astype(np.float32) * np.float32(1.0 / self.preparation.depth_scale)
         # 65535 stands for no value in some data; NaN in images of floats.
         bad = raw == 65535 if raw.dtype == np.uint16 else ~(np.isfinite(depth) & (depth > 0))
         depth[bad] = 0.0
-        if self._preparation.register is not None:
-            depth = self._preparation.register(depth)
-        elif self._preparation.gray is not None:
-            depth = self._preparation.gray.depth(depth)
+        if self.preparation.register is not None:
+            depth = self.preparation.register(depth)
+        elif self.preparation.gray is not None:
+            depth = self.preparation.gray.depth(depth)
         return depth
 
 

@@ -13,7 +13,7 @@ of one line are joined and fitted anew (:mod:`groma.mapping.lines.linking.border
 are estimated by each cluster from its own segments.
 
 The result depends on the size of clusters, not on who works on them. A process needs memory for one cluster and its
-ring; the one that puts lines together for the segments and the lines, not for what was searched.
+ring; the one that puts lines together for all segments, their places and the lines.
 """
 
 from __future__ import annotations

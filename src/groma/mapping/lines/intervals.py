@@ -16,13 +16,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from groma._typing import BoolArray
+from groma._typing import BoolArray, FloatArray
 from groma.estimators.line_intervals import supported_intervals
+from groma.execution import beside
 from groma.gates import gate
 from groma.geometry import segment2
 from groma.geometry.algebra import ratio
 from groma.mapping.lines.gates import AGREEMENT
-from groma.mapping.noise.landmarks import line_end_rows, line_noise
+from groma.mapping.noise.landmarks import line_end_rows, line_sigma_px
 from groma.scene import LineIntervals, Scene
 from groma.scene.line_intervals import observed_shares
 
@@ -48,14 +49,16 @@ def with_supported_intervals(scene: Scene) -> Scene:
     Lines that no two images support anywhere stay as they are.
     """
     seen = scene.line_observations
-    share, length = observed_shares(scene), segment2.length(seen.segment)
+    shares: list[FloatArray] = []
+    with beside(lambda: shares.append(observed_shares(scene))):
+        leaves = _beside_edges(scene)
+    share, length = shares[0], segment2.length(seen.segment)
     size = np.maximum(share[:, 1] - share[:, 0], 1e-12) / np.maximum(length, 1e-12)
-    beside = _beside_edges(scene)
-    known, bent = np.isfinite(share.sum(axis=1)), np.asarray(beside.any(axis=1))[seen.line_idx]
+    known, bent = np.isfinite(share.sum(axis=1)), np.asarray(leaves.any(axis=1))[seen.line_idx]
     whole, cut = np.flatnonzero(known & ~bent), np.flatnonzero(known & bent)
     bounds = np.arange(GATES.parts + 1) / GATES.parts
     low, high = np.maximum(share[cut, :1], bounds[:-1]), np.minimum(share[cut, 1:], bounds[1:])
-    kept = (low < high) & ~beside[seen.line_idx[cut]]
+    kept = (low < high) & ~leaves[seen.line_idx[cut]]
     rows = np.concatenate([whole, cut[np.nonzero(kept)[0]]])
     share = np.concatenate([share[whole], np.column_stack([low[kept], high[kept]])])
     line, found = supported_intervals(seen.line_idx[rows], seen.image_idx[rows], share, size[rows], scene.num_lines)
@@ -78,9 +81,10 @@ def with_supported_intervals(scene: Scene) -> Scene:
 
 def _beside_edges(scene: Scene) -> BoolArray:
     """Tell beside which parts (L, 24) of lines their edges lie."""
-    share, residual, row = line_end_rows(scene)
+    ends = line_end_rows(scene)
+    share, residual, row = ends.share, ends.residual, ends.row
     middle, width = (np.arange(GATES.parts) + 0.5) / GATES.parts, AGREEMENT.same_edge
-    known = np.isfinite(np.column_stack([residual, row.reshape(len(row), 4)]).sum(axis=1))
+    known = np.asarray(ends.good.all(axis=1), np.bool_)
     low, high = np.sort(share, axis=1).T
     seen, part = np.nonzero((low[:, None] <= middle) & (middle <= high[:, None]) & known[:, None])
     weight = (middle[part] - share[seen, 0]) / (share[seen, 1] - share[seen, 0])
@@ -94,5 +98,5 @@ def _beside_edges(scene: Scene) -> BoolArray:
     xx, yy = xx + _SINGULAR * (xx + yy), yy + _SINGULAR * (xx + yy)
     determinant = xx * yy - xy**2
     explained = ratio(yy * xr**2 - 2.0 * xy * xr * yr + xx * yr**2, determinant, determinant > 0.0, 0.0)
-    noise = AGREEMENT.max_squared(2) * line_noise(scene).sigma_px ** 2
+    noise = AGREEMENT.max_squared(2) * line_sigma_px(scene, ends) ** 2
     return ((explained > width**2 * count + noise) & (leaving >= GATES.min_leaving)).reshape(-1, GATES.parts)

@@ -16,8 +16,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.cameras import model as camera_model
+from groma.execution import map_ranges
 from groma.gates import gate
 from groma.geometry import quaternion
 from groma.geometry.algebra import apply, cross, dot, norm, perpendicular, ratio, unit
@@ -41,6 +42,8 @@ class LandmarkNoiseGates:
 
 
 GATES = LandmarkNoiseGates()
+#: Observed segments that one piece of work goes through (cost: time only).
+_ROWS_AT_ONCE = 8192
 
 
 @dataclass(frozen=True)
@@ -122,51 +125,82 @@ def point_noise(scene: Scene, sigma_px: float | None = None) -> PointNoise:
 
 def line_noise(scene: Scene, sigma_px: float | None = None) -> LineNoise:
     """Return the covariances of the lines; ``sigma_px`` None estimates it from the residuals."""
-    table, ends = scene.line_observations, scene.lines.segments
-    direction = unit(ends[:, 1] - ends[:, 0])
-    across = np.stack(perpendicular(direction), axis=1)
+    table, ends = scene.line_observations, line_end_rows(scene)
     information = np.zeros((scene.num_lines, 4, 4))
-    squares, count = np.zeros(scene.num_lines), np.zeros(scene.num_lines, dtype=np.int64)
-    line = table.line_idx
-    for columns in (slice(0, 2), slice(2, 4)):
-        share, residual, row = _end_rows(scene, columns, direction, across)
+    for share, row, good in zip(ends.share.T, np.swapaxes(ends.row, 0, 1), ends.good.T, strict=True):
         row = np.hstack([(1.0 - share)[:, None] * row, share[:, None] * row])
-        good = np.isfinite(residual) & np.isfinite(row).all(axis=1)
-        weight = good / table.sigma
-        residual, row = np.where(good, residual, 0.0) * weight, np.where(good[:, None], row, 0.0) * weight[:, None]
-        information += _sum(row[:, :, None] * row[:, None, :], line, scene.num_lines)
-        squares += _sum(residual[:, None] ** 2, line, scene.num_lines)[:, 0]
+        row = np.where(good[:, None], row, 0.0) * (good / table.sigma)[:, None]
+        information += _sum(row[:, :, None] * row[:, None, :], table.line_idx, scene.num_lines)
+    sigma, misfit = _misfit(*_line_squares(scene, ends), sigma_px)
+    return LineNoise(ends.across, _inverse(information / sigma**2, _extent(scene)), misfit, sigma)
+
+
+def line_sigma_px(scene: Scene, ends: LineEndRows) -> float:
+    """Return the standard deviation that :func:`line_noise` estimates, pixels."""
+    return _misfit(*_line_squares(scene, ends), None)[0]
+
+
+def _line_squares(scene: Scene, ends: LineEndRows) -> tuple[FloatArray, IntArray]:
+    """Sums of the squared whitened residuals of each line (L,), and their degrees of freedom."""
+    line, sigma = scene.line_observations.line_idx, scene.line_observations.sigma
+    squares, count = np.zeros(scene.num_lines), np.zeros(scene.num_lines, dtype=np.int64)
+    for residual, good in zip(ends.residual.T, ends.good.T, strict=True):
+        whitened = np.where(good, residual, 0.0) * (good / sigma)
+        squares += _sum(whitened[:, None] ** 2, line, scene.num_lines)[:, 0]
         count += np.bincount(line[good], minlength=scene.num_lines)
-    sigma, misfit = _misfit(squares, count - 4, sigma_px)
-    return LineNoise(across, _inverse(information / sigma**2, _extent(scene)), misfit, sigma)
+    return squares, count - 4
 
 
-def line_end_rows(scene: Scene) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return of both ends of the observed segments where on their lines they lie, (N, 2) shares, and how far across.
+@dataclass(frozen=True)
+class LineEndRows:
+    """Where the ends of observed segments lie on their lines, and how far across; NaN where one tells nothing."""
 
-    The latter are signed distances (N, 2) from the projected lines, pixels, and their derivatives (N, 2, 2) by a
-    displacement of the line there along two unit vectors across it. NaN where an end tells nothing.
-    """
-    ends = scene.lines.segments
+    #: (L, 2, 3) unit vectors across each line.
+    across: FloatArray
+    #: (N, 2) places on the line: 0 is the first end of its segment, 1 the second.
+    share: FloatArray
+    #: (N, 2) signed distances from the projected line, pixels.
+    residual: FloatArray
+    #: (N, 2, 2) their derivatives by a displacement of the line there along its vectors across it.
+    row: FloatArray
+
+    @property
+    def good(self) -> BoolArray:
+        """(N, 2) whether an end tells something."""
+        known = np.isfinite(self.residual) & np.isfinite(self.share) & np.isfinite(self.row).all(axis=2)
+        return np.asarray(known, np.bool_)
+
+
+def line_end_rows(scene: Scene) -> LineEndRows:
+    """Return where both ends of all observed segments lie."""
+    count, ends = len(scene.line_observations), scene.lines.segments
     direction = unit(ends[:, 1] - ends[:, 0])
     across = np.stack(perpendicular(direction), axis=1)
-    parts = [_end_rows(scene, columns, direction, across) for columns in (slice(0, 2), slice(2, 4))]
-    share, residual, row = (np.stack(both, axis=1) for both in zip(*parts, strict=True))
-    return share, residual, row
+    found = LineEndRows(across, np.empty((count, 2)), np.empty((count, 2)), np.empty((count, 2, 2)))
+
+    def fill(part: slice) -> None:
+        for k in range(2):
+            found.share[part, k], found.residual[part, k], found.row[part, k] = _end_rows(
+                scene, part, slice(2 * k, 2 * k + 2), direction, across
+            )
+
+    map_ranges(fill, count, _ROWS_AT_ONCE)
+    return found
 
 
 def _end_rows(
-    scene: Scene, columns: slice, direction: FloatArray, across: FloatArray
+    scene: Scene, part: slice, columns: slice, direction: FloatArray, across: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Where on its line (N,) an end of each segment lies, how far across it (N,), derivatives (N, 2) of that there."""
-    table, line = scene.line_observations, scene.line_observations.line_idx
-    measured = np.ascontiguousarray(table.segment[:, columns])
-    share = _share_on_line(scene, table.image_idx, measured, scene.lines.segments[line])
+    table = scene.line_observations
+    line, image_idx = table.line_idx[part], table.image_idx[part]
+    measured = np.ascontiguousarray(table.segment[part, columns])
+    share = _share_on_line(scene, image_idx, measured, scene.lines.segments[line])
     first, last = scene.lines.segments[line].transpose(1, 0, 2)
-    pixels, by_world = project_points(scene, table.image_idx, first + share[:, None] * (last - first))
+    pixels, by_world = project_points(scene, image_idx, first + share[:, None] * (last - first))
     tangent = unit(apply(by_world, direction[line]))
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
-    residual = dot(normal, pixel_differences(scene, table.image_idx, pixels, measured))
+    residual = dot(normal, pixel_differences(scene, image_idx, pixels, measured))
     return share, residual, np.einsum("nk,nki,nai->na", normal, by_world, across[line])
 
 

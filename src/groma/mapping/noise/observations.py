@@ -60,6 +60,8 @@ GATES = ObservationNoiseGates()
 _MEDIAN = 2.0 * math.log(2.0)
 #: Guards: smallest squared residual over the usual one (its logarithm is taken), bounds of half the degrees of freedom.
 _MIN_SQUARE, _SHAPES = 1e-4, (0.5, 1e4)
+#: Guards: bounds of the degrees of freedom of segments. How many are tried (cost: each a tenth above the one before).
+_FREEDOM, _BENDS = (0.5, 100.0), 60
 #: Rounds of expectation maximisation (cost: time).
 _STEPS = 20
 
@@ -88,7 +90,42 @@ def line_end_correlation(scene: Scene) -> float:
 
     Segments of lines that few images see follow their line and are left out; where no others are, it is zero.
     """
-    assembly = assemble(scene, AssemblyOptions(points=False, planes=False))
+    first, second = _line_residuals(scene, 0.0).T
+    if len(first) < GATES.min_landmarks:
+        return 0.0
+    shift, turn = np.median(np.abs(first + second)) ** 2, np.median(np.abs(first - second)) ** 2
+    return float(np.clip((shift - turn) / max(shift + turn, 1e-300), -GATES.max_correlation, GATES.max_correlation))
+
+
+def line_bend(scene: Scene, end_correlation: float = 0.0) -> float:
+    r"""Return where a Cauchy loss of segments begins to bend, in the standard deviations that :func:`noise_px` returns.
+
+    Two coordinates that follow Student's distribution with :math:`\nu` degrees of freedom and the variance parameter v
+    have the squared norm q with
+
+    .. math:: -\log p = \frac{\nu + 2}{2} \log\left(1 + \frac{q}{c^2}\right) + \log\frac{c^2}{\nu} + \text{const},
+              \qquad c^2 = \nu v,
+
+    a Cauchy loss of the scale c. The median of q is :math:`c^2 (2^{2/\nu} - 1)`, so that with that of normal noise,
+    :math:`2 \log 2`, only :math:`\nu` is open; it follows by maximum likelihood. Infinite where too few segments tell.
+    """
+    squares = (_line_residuals(scene, end_correlation) ** 2).sum(axis=1)
+    usual = float(np.median(squares)) if len(squares) >= GATES.min_landmarks else 0.0
+    if usual <= 0.0:
+        return math.inf
+    freedom = np.geomspace(*_FREEDOM, _BENDS)
+    bend = _MEDIAN / np.expm1(_MEDIAN / freedom)
+    surprise = [
+        float(((nu + 2.0) / 2.0 * np.log1p(_MEDIAN * squares / usual / c2)).sum() + len(squares) * math.log(c2 / nu))
+        for nu, c2 in zip(freedom, bend, strict=True)
+    ]
+    return math.sqrt(float(bend[int(np.argmin(surprise))]))
+
+
+def _line_residuals(scene: Scene, end_correlation: float) -> FloatArray:
+    """Residuals (N, 2) of segments over their relative deviations, without those of lines that few images see."""
+    options = AssemblyOptions(points=False, planes=False, line_end_correlation=end_correlation)
+    assembly = assemble(scene, options)
     images = np.bincount(scene.line_observations.line_idx, minlength=scene.num_lines)
     ends = [np.zeros((0, 2))]
     for group, factor in zip(assembly.groups, assembly.problem.factors, strict=True):
@@ -99,11 +136,7 @@ def line_end_correlation(scene: Scene) -> float:
         # Where a camera sees behind itself, each end has a weight of its own.
         weighted = residual * unit[:, None] if unit.ndim == 1 else np.einsum("nij,nj->ni", unit, residual)
         ends.append(weighted[told])
-    first, second = np.concatenate(ends).T
-    if len(first) < GATES.min_landmarks:
-        return 0.0
-    shift, turn = np.median(np.abs(first + second)) ** 2, np.median(np.abs(first - second)) ** 2
-    return float(np.clip((shift - turn) / max(shift + turn, 1e-300), -GATES.max_correlation, GATES.max_correlation))
+    return np.concatenate(ends)
 
 
 def moved_px(before: Scene, after: Scene, share: float) -> float:

@@ -25,6 +25,7 @@ import numpy as np
 
 from groma._version import __version__
 from groma.errors import InputError, OutputError
+from groma.execution import beside
 from groma.viz.drawable import Drawable, drawable
 from groma.viz.pack import script_json
 from groma.viz.pictures import ImageFiles
@@ -140,6 +141,9 @@ def write_report(
         diagnosis = numbers.get("diagnosis")
     script = '"use strict";\n' + "".join(_part(f"{name}.js") for name in SCRIPTS)
     held = kept(scene_after)
+    of_scene: list[dict[str, Any]] = []
+    with beside(lambda: of_scene.append(scene_data(scenes, states, held, said.covariances))):
+        of_images = image_data(scene_after, held, states, images)
     parts = {
         "POLICY": _policy(script),
         "STYLE": _part("page.css"),
@@ -154,9 +158,7 @@ def write_report(
         ),
         "TABLES": _page_tables.number_tables(scene_after, before, after, numbers),
         "FOOTER": _footer(),
-        "DATA": script_json(
-            scene_data(scenes, states, held, said.covariances) | image_data(scene_after, held, states, images)
-        ),
+        "DATA": script_json(of_scene[0] | of_images),
         "SCRIPT": script,
     }
     page = re.sub(r"\{\{([A-Z]+)\}\}", lambda match: parts[match[1]], _part("page.html"))

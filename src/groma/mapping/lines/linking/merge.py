@@ -269,9 +269,10 @@ def _pixel_size(tracks: Tracks) -> FloatArray:
     """(L,) size of a pixel at the line, scene units: median over its observations."""
     views = tracks.views
     rows, line = tracks.members()
-    P = views.camera[views.image_idx[rows]]
-    depth = np.einsum("mc,mc->m", P[:, 2, :3], tracks.lines[line].mean(1)) + P[:, 2, 3]
-    size = np.abs(depth) / np.linalg.norm(P[:, 0, :3], axis=1)
+    image, focal = views.image_idx[rows], np.linalg.norm(views.camera[:, 0, :3], axis=1)
+    axis = views.camera[:, 2][image]
+    depth = np.einsum("mc,mc->m", axis[:, :3], tracks.lines.mean(1)[line]) + axis[:, 3]
+    size = np.abs(depth) / focal[image]
     order = np.lexsort([size, line])
     pointers = np.concatenate([[0], np.cumsum(np.bincount(line, minlength=tracks.num_lines))])
     middle = (pointers[:-1] + pointers[1:]) // 2

@@ -12,12 +12,16 @@ import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.line_ends import SegmentRays, trim
+from groma.execution import map_ranges
 from groma.gates import gate
 from groma.mapping.groups import grouped
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.linking.fit import fit_lines
 from groma.mapping.lines.outcomes import Outcome
 from groma.mapping.lines.views import LineViews
+
+#: Observations that one piece of work goes through (cost: time only).
+_ROWS_AT_ONCE = 8192
 
 
 @dataclass(frozen=True)
@@ -126,10 +130,16 @@ class Tracks:
         """(L,) +1 or -1: whether most observations run from the first end point to the second in the image."""
         views = self.views
         rows, line = self.members()
-        P, X = views.camera[views.image_idx[rows]], self.lines[line]
-        x = np.einsum("mij,mkj->mki", P[:, :, :3], X) + P[:, None, :, 3]
-        x = x[..., :2] / x[..., 2:]
-        along = ((x[:, 1] - x[:, 0]) * (views.ends[rows, 2:] - views.ends[rows, :2])).sum(-1)
+        along = np.empty(len(rows))
+
+        def fill(part: slice) -> None:
+            own = rows[part]
+            P, X = views.camera[views.image_idx[own]], self.lines[line[part]]
+            x = np.einsum("mij,mkj->mki", P[:, :, :3], X) + P[:, None, :, 3]
+            x = x[..., :2] / x[..., 2:]
+            along[part] = ((x[:, 1] - x[:, 0]) * (views.ends[own, 2:] - views.ends[own, :2])).sum(-1)
+
+        map_ranges(fill, len(rows), _ROWS_AT_ONCE)
         return np.sign(np.bincount(line, weights=np.sign(along), minlength=self.num_lines))
 
     def with_groups(self, members: IntArray, representative: IntArray, ends: FloatArray) -> Tracks:
