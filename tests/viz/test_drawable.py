@@ -7,7 +7,7 @@ from _scene import PINHOLE, exact_scene
 
 from groma.geometry import se3
 from groma.scene import Scene
-from groma.viz.drawable import drawable
+from groma.viz.drawable import drawable, rms_by_group
 
 
 def test_exact_observations_have_no_residual():
@@ -54,6 +54,13 @@ def test_points_behind_a_camera_are_not_counted():
     assert np.isnan(shown.residuals[[0, 12]]).all()
     assert np.isnan(shown.point_errors[0])
     assert np.isfinite(shown.rms_by_image).all()
+
+
+def test_squares_of_huge_residuals_do_not_overflow():
+    """As of a damaged model with a point at 1e308; a page must hold finite numbers."""
+    lengths = np.array([3e200, 4e200, 1.7e308, 3.0, 4.0, 0.0, np.nan])
+    found = rms_by_group(lengths, np.array([0, 0, 1, 2, 2, 3, 2]), 5)
+    np.testing.assert_allclose(found, [np.sqrt(12.5) * 1e200, 1.7e308, np.sqrt(12.5), 0.0, 0.0], rtol=1e-15)
 
 
 def test_camera_axes_and_centres():

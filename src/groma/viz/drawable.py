@@ -121,11 +121,17 @@ def junctions(segments: FloatArray, pairs: IntArray) -> FloatArray:
 
 
 def rms_by_group(lengths: FloatArray, group: IntArray, size: int, empty: float = 0.0) -> FloatArray:
-    """Return the root mean square (size,) of the known lengths (M,) of each group; ``empty`` where there are none."""
+    """Return the root mean square (size,) of the known lengths (M,) of each group; ``empty`` where there are none.
+
+    Squares are taken in a power of two near the largest of a group, so that none overflows and nothing is rounded.
+    """
     known = np.isfinite(lengths)
-    count = np.bincount(group[known], minlength=size)
-    total = np.bincount(group[known], lengths[known] ** 2, minlength=size)
-    return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), empty)
+    lengths, group = lengths[known], group[known]
+    count, largest = np.bincount(group, minlength=size), np.zeros(size)
+    np.maximum.at(largest, group, lengths)
+    unit = np.ldexp(1.0, np.frexp(largest)[1] - 1)
+    total = np.bincount(group, (lengths / unit[group]) ** 2, minlength=size)
+    return np.where(count > 0, unit * np.sqrt(total / np.maximum(count, 1)), empty)
 
 
 # ------------------------------------------------------------------------------------------------------ Residuals
