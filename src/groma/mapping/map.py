@@ -73,17 +73,13 @@ class MappingGates:
     """How noise becomes weight, and when lines are mapped again."""
 
     loss_scale: float = gate(
-        6.0,
-        "sigma",
-        "scale of the first loss: matches have a narrow core and heavy tails",
+        6.0, "sigma", "scale of the first loss: matches have a narrow core and heavy tails",
         "chosen on benchmarks/surveyed.py",
-    )
+    )  # fmt: skip
     last_loss_scale: float = gate(
-        4.0,
-        "sigma",
-        "scale of the Cauchy loss of the last adjustment, relative to the noise of each point",
+        4.0, "sigma", "scale of the Cauchy loss of the last adjustment, relative to the noise of each point",
         "derived from Student's distribution that fits these residuals best, which bends at 4 to 5",
-    )
+    )  # fmt: skip
     moved_share: float = gate(
         0.1,
         "share",
@@ -286,15 +282,16 @@ def map_segments(
         if scene.num_lines == 0 or moved_px(before, joint, GATES.moved_share) <= options.lines.noise:
             break
     if scene.num_lines:
-        bend = math.inf if options.refine_poses else line_bend(scene, weighted.line_end_correlation)
-        tails = {"loss_scale": GATES.last_loss_scale, "line_loss_factor": min(bend / GATES.last_loss_scale, 1.0)}
-        weighted = dataclasses.replace(weighted, loss="cauchy", **tails)
+        factor, scale = 1.0, GATES.last_loss_scale
+        if not options.refine_poses:
+            factor = min(line_bend(scene, weighted.line_end_correlation) / scale, 1.0)
+        weighted = dataclasses.replace(weighted, loss="cauchy", loss_scale=scale, line_loss_factor=factor)
     sigma_px = weighted.point_sigma_px, weighted.line_sigma_px * math.sqrt(1.0 + weighted.line_end_correlation)
     if options.find_planes:
         scene = stages.run(find_planes, scene)
         of_planes = partial(surface_noise_px, scene, options.structure)
-        scene, surface_px = together(partial(with_shared_noise, scene, *sigma_px), of_planes)
-        weighted = dataclasses.replace(weighted, structure_sigma_px=surface_px)
+        scene, surface = together(partial(with_shared_noise, scene, *sigma_px), of_planes)
+        weighted = dataclasses.replace(weighted, structure_sigma_px=surface)
     else:
         scene = with_shared_noise(scene, *sigma_px)
     adjusted = stages.run(adjust_everything, scene, weighted)
