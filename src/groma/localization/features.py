@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.execution import together
 from groma.features.contract import SegmentDetector
 from groma.features.images import GrayImage
 from groma.features.matching.descriptor import Descriptors, describe
@@ -157,11 +158,14 @@ def find_features(
     image: GrayImage, camera: QueryCamera, lines: bool = True, min_length: float = 15.0
 ) -> DescribedImage:
     """Find and describe points and segments; segments without the distortion of the lens."""
-    segments = Segments.empty()
-    if lines:
+
+    def segments() -> tuple[Segments, Descriptors]:
         detector = DETECTORS.make("lsd", min_length=min_length, max_segments=0)
-        segments = _segments(image, camera, detector)
-    return DescribedImage(find_points(image).joined(find_corners(image)), segments, describe(image, segments))
+        found = _segments(image, camera, detector) if lines else Segments.empty()
+        return found, describe(image, found)
+
+    points, found = together(lambda: find_points(image).joined(find_corners(image)), segments)
+    return DescribedImage(points, *found)
 
 
 def _segments(image: GrayImage, camera: QueryCamera, detector: SegmentDetector) -> Segments:

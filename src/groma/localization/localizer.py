@@ -18,13 +18,19 @@ from groma.errors import InputError
 from groma.features.images import GrayImage, to_gray
 from groma.gates import gate
 from groma.io import read_scene
-from groma.localization.candidates import Candidates, described_alike, found_near
+from groma.localization.candidates import Candidates, MirrorImage, closest_of, described_alike, found_near
 from groma.localization.expected import FoundAgain, nearest_images, shown_of
-from groma.localization.features import DescribedImage, DescribedPoints, find_features, mirrored
+from groma.localization.features import DescribedImage, DescribedPoints, find_features
 from groma.localization.landmarks import DescribedLandmarks, coarsest, seen_in
 from groma.localization.map_images import OPTIONS, image_paths, images_in_summary
 from groma.localization.map_index import images_told, kept_index
-from groma.localization.pose.absolute_pose import UNKNOWN_LENS, AbsolutePose, PoseOptions, pose_from_matches
+from groma.localization.pose.absolute_pose import (
+    UNKNOWN_LENS,
+    AbsolutePose,
+    MirrorQuestions,
+    PoseOptions,
+    pose_from_matches,
+)
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
@@ -212,16 +218,14 @@ class Localizer:
         last = [found]
 
         def guided(best: Refined) -> Matches:
-            sigma = best.sigma0 * max(1.0, float(np.median(query.points.sigma)) if len(query.points) else 1.0)
-            reach = max_errors(Matches(point_sigma=np.zeros(0)))[0] * sigma
+            reach = self._reach(query, best)
             last[0] = found_near(
                 query, self.scene, self.index, near, best.camera, best.pose, (reach, reach), self.options.lines
             )
             return last[0].matches(query, self.scene, self.index)
 
-        def mirror(step: int) -> Matches:
-            points = mirrored(part.points.take(np.arange(0, len(part.points), step)), camera.width)
-            return matched(points, self._alike(points)).matches(part.with_points(points), self.scene, self.index)
+        def closest(best: Refined, other: Refined) -> tuple[int, int]:
+            return closest_of(last[0].distance[best.point_inliers], mirror.distances(other, self._reach(query, best)))
 
         def expected(best: Refined) -> tuple[tuple[float, float], float]:
             seen, agreeing = last[0].matches(query, self.scene, self.index), last[0].points[best.point_inliers, 1]
@@ -231,8 +235,19 @@ class Localizer:
             return shown_of(self.scene, self.index, self._again, around, best, seen, alike, self.options.lines)
 
         matches = found.matches(part, self.scene, self.index)
-        pose = pose_from_matches(camera, matches, options, max(len(images), 1), guided, mirror, expected)
+        mirror = MirrorImage(
+            query, part, camera, self.scene, self.index, lambda points: matched(points, self._alike(points)),
+            self.options.gates.near,
+        )  # fmt: skip
+        asked = MirrorQuestions(mirror.matches, closest)
+        pose = pose_from_matches(camera, matches, options, max(len(images), 1), guided, asked, expected)
         return pose, last[0]
+
+    @staticmethod
+    def _reach(query: DescribedImage, best: Refined) -> float:
+        """How far from where a pose says points are looked for, pixels."""
+        sigma = best.sigma0 * max(1.0, float(np.median(query.points.sigma)) if len(query.points) else 1.0)
+        return max_errors(Matches(point_sigma=np.zeros(0)))[0] * sigma
 
     def _alike(self, points: DescribedPoints) -> IntArray:
         """The images of the map to match with, the most alike first."""

@@ -21,7 +21,7 @@ from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import max_errors, propose, straightened
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pieces import cells_elsewhere
-from groma.localization.pose.refinement import Refined, cells_of, fitted, refine
+from groma.localization.pose.refinement import LensUnknowns, Refined, cells_of, fitted, refine
 from groma.localization.pose.verdict import (
     Evidence,
     Status,
@@ -56,11 +56,26 @@ class PoseOptions:
     #: Focal lengths that are tried, over that of the camera: :data:`UNKNOWN_LENS` where nothing is known of it.
     focal_factors: tuple[float, ...] = (1.0,)
 
+    @property
+    def lens(self) -> LensUnknowns:
+        """What is estimated of the lens."""
+        return "all" if self.refine_lens else "none"
+
 
 #: Of so many points of a mirror image one is matched first.
 _SOME = 4
 #: Focal lengths of phones to telephoto lenses, over the longer side of the image, in steps of a fifth.
 UNKNOWN_LENS = tuple(0.5 * 1.2**step for step in range(10))
+
+
+@dataclass(frozen=True)
+class MirrorQuestions:
+    """What is asked of the mirror image of a photograph, to tell whether it was mirrored."""
+
+    #: Its matches, by each so many-th point.
+    matches: Callable[[int], Matches]
+    #: Of the most alike matches with a pose of the photograph, and with one of its mirror image: how many are of each.
+    closest: Callable[[Refined, Refined], tuple[int, int]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +192,7 @@ def pose_from_matches(
     options: PoseOptions | None = None,
     places: int = 1,
     guided: Callable[[Refined], Matches] | None = None,
-    mirror: Callable[[int], Matches] | None = None,
+    mirror: MirrorQuestions | None = None,
     expected: Callable[[Refined], tuple[tuple[float, float], float]] | None = None,
 ) -> AbsolutePose:
     """Estimate a pose as :func:`estimate_absolute_pose` does.
@@ -191,9 +206,8 @@ def pose_from_matches(
     guided : callable, optional
         Returns more matches once a pose is near; they refine it, and are those that the result tells of. They are no
         evidence that the place is right, because they were looked for where it says.
-    mirror : callable, optional
-        Returns the matches of the mirror image of the photograph, by each so many-th point: where they agree with a
-        pose far better, the photograph was mirrored.
+    mirror : MirrorQuestions, optional
+        What is asked of the mirror image of the photograph.
     expected : callable, optional
         Returns how many parts of the image show what a pose puts there, and how many show none of it; and how often
         what only this place has is found, as a share of how often all of it is.
@@ -209,8 +223,8 @@ def pose_from_matches(
     if guided is not None and first.significant:
         used = guided(best)
         errors = _errors(used, options)
-        best = refine(best.camera, used, best.pose, errors, options.refine_lens, gathered=True)
-        own = fitted(best.camera, matches, best.pose, errors, options.refine_lens)
+        best = refine(best.camera, used, best.pose, errors, options.lens, gathered=True)
+        own = fitted(best.camera, matches, best.pose, errors, options.lens)
         first = evidence_of(own, matches, places)
     covariance = best.covariance(used)
     distance = median_distance(best.pose, _seen(used, best))
@@ -222,9 +236,9 @@ def pose_from_matches(
         parts, alone = expected(best)
         verdict = doubted_if_repeated(doubted_if_missing(verdict, *parts), alone)
     if mirror is not None and verdict.status == "localized":
-        verdict = _unless_mirrored(verdict, own, mirror, matches, options)
+        verdict = _unless_mirrored(verdict, best, own, mirror, matches, options)
     if not options.refine_lens and verdict.status == "localized":
-        verdict = doubted_if_other_lens(verdict, *focal_step(best, used))
+        verdict = doubted_if_other_lens(verdict, *focal_step(best, used, _errors(used, options)))
     failed = verdict.status == "failed"
     return AbsolutePose(
         verdict.status,
@@ -243,22 +257,35 @@ def pose_from_matches(
 
 
 def _unless_mirrored(
-    verdict: Verdict, best: Refined, mirror: Callable[[int], Matches], matches: Matches, options: PoseOptions
+    verdict: Verdict,
+    best: Refined,
+    own: Refined,
+    mirror: MirrorQuestions,
+    matches: Matches,
+    options: PoseOptions,
 ) -> Verdict:
-    """Return a verdict, or another one where the mirror image of a photograph fits clearly better.
+    """Return a verdict, or another one where the mirror image of a photograph fits about as well, and by matches that
+    are more alike.
 
     Some of its points are matched first: mostly far too few of them agree with any pose.
     """
-    agree = len(np.unique(cells_of(matches.points2d, best.camera, VERDICT.cells)[best.point_inliers]))
-    some, votes = mirror(_SOME), votes_of_a_part(agree + 1, 1.0 / _SOME)
-    other = _best_of_others(best.camera, some, options, votes)
-    if other is None or evidence_of(other, some).agree < votes:
-        return verdict
     points = matches.take(np.ones(matches.num_points, bool), np.zeros(matches.num_lines, bool))
-    own = evidence_of(fitted(best.camera, points, best.pose, _errors(points, options)), points)
-    every = mirror(1)
-    other = _best_of_others(best.camera, every, options, own.agree + 1)
-    return verdict if other is None else doubted_if_mirrored(verdict, own, evidence_of(other, every))
+    agree = len(np.unique(cells_of(points.points2d, own.camera, VERDICT.cells)[own.point_inliers]))
+    wanted = votes_of_a_rival(agree)
+    votes = votes_of_a_part(wanted, 1.0 / _SOME)
+    if votes:
+        some = mirror.matches(_SOME)
+        other = _best_of_others(own.camera, some, options, votes)
+        if other is None or evidence_of(other, some).agree < votes:
+            return verdict
+    every = mirror.matches(1)
+    other = _best_of_others(own.camera, every, options, wanted)
+    if other is None:
+        return verdict
+    evidence = evidence_of(other, every)
+    if not evidence.significant or evidence.agree < wanted:
+        return verdict
+    return doubted_if_mirrored(verdict, *mirror.closest(best, other))
 
 
 def _errors(matches: Matches, options: PoseOptions) -> tuple[float, float]:
@@ -285,7 +312,7 @@ def _best(
     errors = _errors(matches, options)
     starts = [_with_focal_length(camera, factor) for factor in options.focal_factors]
     found = [(propose(straightened(one, matches), errors, options.seed, share, least), one) for one in starts]
-    refined = [refine(one, matches, pose, errors, options.refine_lens) for pose, one in found if pose is not None]
+    refined = [refine(one, matches, pose, errors, options.lens) for pose, one in found if pose is not None]
     return max(refined, key=lambda one: int(one.point_inliers.sum() + one.line_inliers.sum()), default=None)
 
 

@@ -78,7 +78,7 @@ class VerdictGates:
     focal: float = gate(
         0.01, "share", "of the focal length: a step of its estimate that tells another lens", "convention: a hundredth"
     )
-    focal_noise: float = gate(5.0, "sigma", "that such a step must have", "convention: five sigma, of a discovery")
+    focal_noise: float = gate(3.3, "sigma", "that such a step must have", "derived from `right`: 1 in 1000")
     bend: float = gate(
         0.15, "share", "of their distance, by which neighbours may be off differently",
         "derived from perspective: as between views 10 degrees apart",

@@ -30,6 +30,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Literal
 
 import numpy as np
 
@@ -45,8 +46,9 @@ from groma.geometry import se3
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.gates import REFINEMENT, RefinementGates
 from groma.localization.pose.matches import Matches, nearest_claims
+from groma.localization.pose.pose_fit import FINELY, ROUGHLY, fit_pose
 from groma.localization.pose.records import landmark_rows, records, times
-from groma.localization.pose.residuals import Residuals, residual_squares_of, residuals, without_far
+from groma.localization.pose.residuals import Residuals, residual_squares_of, residuals, weighted_near
 from groma.problem.problem import Problem
 from groma.scene import LineObservations, Lines, PointObservations, Points, Scene
 from groma.solver.options import SolverOptions
@@ -55,14 +57,11 @@ from groma.solver.solve import solve
 _ASSEMBLY = AssemblyOptions(
     point_chart="euclidean", drop_behind=False, require_in_front=True, gauge="free", refine_landmarks=False
 )
-_POSE = SolverOptions(
-    max_iterations=12, function_tolerance=1e-5, initial_damping=1e-6, threads=1, eliminate=("frames",)
-)
 #: Information of scaled unknowns below which they are not determined.
 _SINGULAR = 1e-10
 _LENS = SolverOptions(max_iterations=30, function_tolerance=1e-6, threads=1)
-#: Before the last fit a pose is only to collect what is near (cost: of steps).
-_ROUGHLY = 1e-3
+#: What is estimated of the lens.
+LensUnknowns = Literal["none", "focal", "all"]
 
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
@@ -109,20 +108,24 @@ class Refined:
 
     def covariance(self, matches: Matches, gates: RefinementGates = REFINEMENT) -> FloatArray:
         """(6, 6) covariance of the left twist; infinite where the matches do not determine the pose."""
+        return self.joint_covariance(matches, gates)[:6, :6]
+
+    def joint_covariance(self, matches: Matches, gates: RefinementGates = REFINEMENT) -> FloatArray:
+        """(6 + k, 6 + k) covariance of the left twist and of what is estimated of the lens."""
         noise = self.noise_covariance(matches, gates)
         if matches.shared_error == 0.0 or not np.isfinite(noise).all():
             return noise
         return noise + matches.shared_error**2 * self.shared_covariance(matches, gates)
 
     def shared_covariance(self, matches: Matches, gates: RefinementGates = REFINEMENT) -> FloatArray:
-        """(6, 6) covariance of the left twist if what each cell shows is off by one radian, together."""
+        """Covariance of the same if what each cell shows is off by one radian, together."""
         chosen = ((self.points, self.point_inliers), (self.lines, self.line_inliers))
         J = np.concatenate([found.by_pose[kept] * np.sqrt(found.spread[kept, None, None]) for found, kept in chosen])
         cell = self._cells(matches, gates)
         J /= float(self.camera.kind.focal_length(self.camera.params))
         information = np.einsum("n,nki,nkj->ij", 1.0 / np.bincount(cell)[cell], J, J)
         scale = 1.0 / np.sqrt(np.diag(information))
-        return (np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale))[:6, :6]
+        return np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
 
     def _cells(self, matches: Matches, gates: RefinementGates) -> IntArray:
         """Number the matches that agree by the cells of the image that they lie in."""
@@ -130,16 +133,16 @@ class Refined:
         return cells_of(np.concatenate([matches.points2d[self.point_inliers], middle]), self.camera, gates.cells)
 
     def noise_covariance(self, matches: Matches, gates: RefinementGates = REFINEMENT) -> FloatArray:
-        """(6, 6) covariance of the left twist by the noise of image and landmarks alone."""
+        """Covariance of the same by the noise of image and landmarks alone."""
         chosen = ((self.points, self.point_inliers), (self.lines, self.line_inliers))
         J = np.concatenate([found.by_pose[kept] for found, kept in chosen])
         r = np.concatenate([found.value[kept] for found, kept in chosen])
         scale = np.sqrt((J**2).sum(axis=(0, 1)))
         if not (scale > 0.0).all():
-            return np.full((6, 6), np.inf)
+            return np.full((J.shape[2], J.shape[2]), np.inf)
         values, vectors = np.linalg.eigh(np.einsum("nki,nkj->ij", J / scale, J / scale))
         if not values[0] > _SINGULAR:
-            return np.full((6, 6), np.inf)
+            return np.full((J.shape[2], J.shape[2]), np.inf)
         pull, sigma = _pull(r, J.shape[2], gates)
         root = sigma * vectors / np.sqrt(values) / scale[:, None]
         cell = self._cells(matches, gates)
@@ -150,7 +153,7 @@ class Refined:
             shared, axes = np.linalg.eigh(gradient.T @ gradient * (count / (count - dof)))
             by_chance = (1.0 + np.sqrt(dof / count)) ** 2  # the largest such eigenvalue of independent errors
             root = root @ axes * np.sqrt(np.where(shared > by_chance, shared, 1.0))
-        return (root @ root.T)[:6, :6]
+        return root @ root.T
 
 
 def _pull(residual: FloatArray, unknowns: int, gates: RefinementGates) -> tuple[FloatArray, float]:
@@ -203,7 +206,7 @@ def refine(
     matches: Matches,
     start: FloatArray,
     max_error: tuple[float, float],
-    refine_lens: bool = False,
+    lens: LensUnknowns = "none",
     gathered: bool = False,
     gates: RefinementGates = REFINEMENT,
 ) -> Refined:
@@ -217,39 +220,40 @@ def refine(
         cam_from_world.
     max_error
         Matches of points and lines further from where a pose puts them, pixels, say nothing about pose and noise.
-    refine_lens
-        Estimate focal length and distortion, too.
+    lens
+        Estimate the focal length (several by one factor), or all of the lens, too.
     gathered
         The matches were looked for near the start, as far as it may be off: all of them are near at first.
     gates
         Numbers of the fit.
     """
-    problem, options = problem_of(camera, matches, start, refine_lens), _LENS if refine_lens else _POSE
+    problem = problem_of(camera, matches, start, lens == "all")
     limits = [
         (error / sigma) ** 2
         for error, sigma in zip(max_error, (matches.point_sigma, matches.segment_sigma), strict=True)
     ]
     near: tuple[BoolArray, BoolArray] | None = None
     for round_ in range(gates.rounds + 1):
-        weighted = with_landmarks(problem, matches)
-        squares = residual_squares_of(weighted, matches)
+        weights = landmark_weights(problem, matches)
+        squares = residual_squares_of(problem, weights, matches)
         wide = gathered and round_ == 0
         before, near = near, (wide | (squares[0] <= limits[0]), wide | (squares[1] <= limits[1]))
         last = round_ == gates.rounds or (before is not None and all(map(np.array_equal, near, before)))
         loss = GemanMcClure(last_scale(_agreeing(squares, gates), gates)) if last else Cauchy(gates.wide_loss)
-        steps = options if last or refine_lens else replace(options, function_tolerance=_ROUGHLY)
-        solved = solve(with_loss(without_far(weighted, near), loss), steps).problem
-        estimated = _camera_of(solved, camera) if refine_lens else camera
+        if lens == "all":
+            solved = solve(with_loss(weighted_near(problem, weights, near), loss), _LENS).problem
+            states = {name: group.state for name, group in solved.variables.items()}
+        else:
+            focal = np.array(camera.kind.focal_indices) if lens == "focal" else None
+            states = fit_pose(problem, weights, near, loss, FINELY if last else ROUGHLY, focal)
+        moved = problem.with_states(states)
+        estimated = camera if lens == "none" else _camera_of(moved, camera)
         if estimated is None:
             break
-        camera = estimated
-        problem = problem.with_states({name: group.state for name, group in solved.variables.items()})
+        camera, problem = estimated, moved
         if last:
             break
-    pose = problem.variables["frames"].state[0]
-    if refine_lens:
-        problem = problem_of(camera, matches, pose, False)
-    return _fitted(with_landmarks(problem, matches), camera, matches, max_error, refine_lens, gates)
+    return _fitted(problem, camera, matches, max_error, lens, gates)
 
 
 def _agreeing(squares: tuple[FloatArray, FloatArray], gates: RefinementGates) -> int:
@@ -269,12 +273,11 @@ def fitted(
     matches: Matches,
     pose: FloatArray,
     max_error: tuple[float, float],
-    refine_lens: bool = False,
+    lens: LensUnknowns = "none",
     gates: RefinementGates = REFINEMENT,
 ) -> Refined:
     """Say which matches agree with a pose as it is; parameters as of :func:`refine`."""
-    problem = with_landmarks(problem_of(camera, matches, pose, False), matches)
-    return _fitted(problem, camera, matches, max_error, refine_lens, gates)
+    return _fitted(problem_of(camera, matches, pose, False), camera, matches, max_error, lens, gates)
 
 
 def _fitted(
@@ -282,13 +285,13 @@ def _fitted(
     camera: QueryCamera,
     matches: Matches,
     max_error: tuple[float, float],
-    refine_lens: bool,
+    lens: LensUnknowns,
     gates: RefinementGates,
 ) -> Refined:
-    pose = problem.variables["frames"].state[0]
-    lens = _lens_columns(camera) if refine_lens else []
-    points = residuals(problem, "points", matches.num_points, lens)
-    lines = residuals(problem, "lines", matches.num_lines, lens)
+    pose, weights = problem.variables["frames"].state[0], landmark_weights(problem, matches)
+    directions = _lens_directions(camera, lens)
+    points = residuals(problem, weights, "points", matches.num_points, directions)
+    lines = residuals(problem, weights, "lines", matches.num_lines, directions)
     sigma0 = _noise((points, lines), matches, max_error, gates)
     limit = chi_square_gate(gates.outlier, 2) * sigma0**2
     near = (points.square <= limit, (lines.square <= limit) & _in_front(camera, matches, pose))
@@ -316,8 +319,14 @@ def _in_front(camera: QueryCamera, matches: Matches, pose: FloatArray) -> BoolAr
     return np.einsum("ni,ni->n", start, ray) * square > np.einsum("ni,ni->n", start, way) * along
 
 
-def _lens_columns(camera: QueryCamera) -> list[int]:
-    return sorted((*camera.kind.focal_indices, *camera.kind.extra_indices))
+def _lens_directions(camera: QueryCamera, lens: LensUnknowns) -> FloatArray | None:
+    """Directions (p, k) in which parameters of a camera are estimated: the logarithm of its focal length, or all."""
+    focal = list(camera.kind.focal_indices)
+    if lens == "none":
+        return None
+    if lens == "focal":
+        return np.where(np.isin(np.arange(len(camera.params)), focal), camera.params, 0.0)[:, None]
+    return np.eye(len(camera.params))[:, sorted((*focal, *camera.kind.extra_indices))]
 
 
 def problem_of(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_lens: bool = False) -> Problem:
@@ -337,23 +346,24 @@ def problem_of(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_l
     return assemble(scene, replace(_ASSEMBLY, refine_intrinsics=refine_lens)).problem
 
 
-def with_landmarks(problem: Problem, matches: Matches) -> Problem:
-    """Return a problem whose noise holds that of its landmarks, too, as they are seen from where its pose is."""
+def landmark_weights(problem: Problem, matches: Matches) -> list[FloatArray]:
+    """Inverse noise (n, 2, 2) of the factors of a problem that holds that of their landmarks, too, as they are seen
+    from where its pose is.
+    """
     covariances = {"points": matches.point_covariance, "lines": matches.line_covariance}
-    return Problem(problem.variables, [_widened(problem, factor, covariances) for factor in problem.factors])
+    return [_widened(problem, factor, covariances) for factor in problem.factors]
 
 
-def _widened(problem: Problem, factor: Factor, covariances: dict[str, FloatArray]) -> Factor:
+def _widened(problem: Problem, factor: Factor, covariances: dict[str, FloatArray]) -> FloatArray:
+    image = np.broadcast_to(times(factor.sqrt_information, np.eye(2)[None]), (len(factor), 2, 2))
     for name, covariance in covariances.items():
         rows = landmark_rows(factor, name)
-        if rows is None or not covariance.any():
-            continue
-        J = records(problem, factor, {name[:-1]: covariance.shape[1]})
-        image = np.broadcast_to(times(factor.sqrt_information, np.eye(2)[None]), (len(factor), 2, 2))
-        sqrt_information = np.empty((len(factor), 2, 2))
-        _widen(image, J, covariance, rows, sqrt_information)
-        return replace(factor, sqrt_information=sqrt_information)
-    return factor
+        if rows is not None and covariance.any():
+            J = records(problem, factor, {name[:-1]: covariance.shape[1]})
+            sqrt_information = np.empty((len(factor), 2, 2))
+            _widen(image, J, covariance, rows, sqrt_information)
+            return sqrt_information
+    return np.ascontiguousarray(image)
 
 
 def _noise(

@@ -138,17 +138,15 @@ def judge(
     return Verdict("localized", probability, f"{agree} agree.")
 
 
-def doubted_if_mirrored(verdict: Verdict, own: Evidence, mirror: Evidence, gates: VerdictGates = VERDICT) -> Verdict:
-    """Return a verdict, or ``uncertain`` where the mirror image fits far better than the photograph (own).
-
-    More must agree with the mirror image, and, since mirrored photographs are as rare as wrong poses may be, be by so
-    much less likely by chance.
+def doubted_if_mirrored(verdict: Verdict, own: int, mirror: int, gates: VerdictGates = VERDICT) -> Verdict:
+    """Return a verdict, or ``uncertain`` where of the most alike matches more are with the mirror image of a photograph
+    (mirror) than with the photograph (own).
     """
-    rare = mirror.log_alarms <= own.log_alarms + math.log(1.0 - gates.right)
-    if not (mirror.significant and mirror.agree > own.agree and rare):
+    if mirror <= own:
         return verdict
     words = (
-        f"{mirror.agree} measurements speak for its mirror image, {own.agree} for the photograph: it may be mirrored."
+        f"{verdict.sentence} But its mirror image fits about as well, and {mirror} of its matches are as alike as "
+        f"{own} of the photograph: it may be mirrored."
     )
     return Verdict("uncertain", 1.0 - gates.right, words)
 

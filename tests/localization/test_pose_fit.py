@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Fits of one pose end where a robust cost is least, with and without the focal length; a wrong one is told."""
+
+import numpy as np
+import pytest
+from worlds import CAMERA, make_world, project
+
+from groma.factors.losses import Cauchy, GemanMcClure
+from groma.geometry import se3
+from groma.localization.candidates import closest_of
+from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose
+from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.focal_length import focal_step
+from groma.localization.pose.hypotheses import max_errors
+from groma.localization.pose.matches import Matches
+from groma.localization.pose.pose_fit import fit_pose
+from groma.localization.pose.refinement import landmark_weights, problem_of, refine
+from groma.solver.options import SolverOptions
+
+#: Ends where a step gains nothing in double precision.
+TO_THE_END = SolverOptions(function_tolerance=1e-15, max_iterations=100)
+
+
+def scaled(factor, camera=CAMERA):
+    params = camera.params.copy()
+    params[:2] *= factor
+    return QueryCamera(camera.model, params, camera.width, camera.height)
+
+
+def noisy(rng, points, lines, sigma=0.7):
+    world = make_world(rng, points, lines)
+    world.points2d[:] += rng.normal(0.0, sigma, world.points2d.shape)
+    world.segments2d[:] += rng.normal(0.0, sigma, world.segments2d.shape)
+    return world, Matches(world.points2d, world.points3d, world.segments2d, world.segments3d).with_sigma(sigma)
+
+
+def cost_of(matches, near, loss, pose, camera, sigma=0.7):
+    """The cost, written down once more: pixels for points, distances of both ends for lines."""
+    off = (project(camera, pose, matches.points3d) - matches.points2d) / sigma
+    a, b = np.moveaxis(project(camera, pose, matches.segments3d), 1, 0)
+    across = np.column_stack([b[:, 1] - a[:, 1], a[:, 0] - b[:, 0]]) / np.linalg.norm(b - a, axis=1, keepdims=True)
+    ends = np.einsum("nki,ni->nk", matches.segments2d - a[:, None], across) / sigma
+    squares = np.concatenate([(off**2).sum(axis=1)[near[0]], (ends**2).sum(axis=1)[near[1]]])
+    return 0.5 * loss.evaluate(squares)[0].sum()
+
+
+@pytest.mark.parametrize("loss", [Cauchy(1.5), GemanMcClure(1.9)])
+@pytest.mark.parametrize("focal", [False, True])
+def test_the_cost_is_least_where_a_fit_ends(loss, focal):
+    """Central differences through the motions of pose and focal length: the slope is zero, and every way is upwards."""
+    rng = np.random.default_rng(3)
+    for _ in range(3):
+        world, matches = noisy(rng, 40, 15)
+        near = rng.uniform(size=40) < 0.8, rng.uniform(size=15) < 0.8
+        problem = problem_of(CAMERA, matches, world.pose)
+        which = np.array([0, 1]) if focal else None
+        states = fit_pose(problem, landmark_weights(problem, matches), near, loss, TO_THE_END, which)
+        pose = states["frames"][0]
+        camera = QueryCamera("PINHOLE", states["intrinsics/PINHOLE"][0], 640, 480) if focal else CAMERA
+        least = cost_of(matches, near, loss, pose, camera)
+        for k in range(7 if focal else 6):
+            slopes, steps = [], (1e-4, 1e-3)
+            for step in steps:
+                costs = []
+                for side in (-step, step):
+                    twist = np.where(np.arange(6) == k, side, 0.0)
+                    moved = se3.compose(se3.exp(twist[None]), pose[None])[0]
+                    lens = scaled(np.exp(side), camera) if k == 6 else camera
+                    costs.append(cost_of(matches, near, loss, moved, lens))
+                assert min(costs) > least
+                slopes.append((costs[1] - costs[0]) / (costs[1] + costs[0] - 2.0 * least) * step)
+            # The distance to the minimum of a parabola, twice: a third derivative is all that may be left.
+            assert abs(slopes[0]) < 1e-5
+
+
+def test_what_is_not_near_has_no_part():
+    world, _ = noisy(np.random.default_rng(5), 60, 20)
+    near = np.arange(60) < 40, np.arange(20) < 12
+    found = []
+    for shift in (0.0, 50.0):
+        world.points2d[40:] += shift
+        world.segments2d[12:] += shift
+        moved = Matches(world.points2d, world.points3d, world.segments2d, world.segments3d).with_sigma(0.7)
+        problem = problem_of(CAMERA, moved, world.pose)
+        weights = landmark_weights(problem, moved)
+        found.append(fit_pose(problem, weights, near, Cauchy(1.5), TO_THE_END)["frames"][0])
+    assert found[0] == pytest.approx(found[1], abs=1e-10)
+
+
+@pytest.mark.parametrize("factor", [0.8, 0.95, 1.05, 1.25])
+def test_a_wrong_focal_length_is_found(factor):
+    rng = np.random.default_rng(7)
+    for _ in range(3):
+        world, matches = noisy(rng, 150, 30)
+        wrong = scaled(factor)
+        best = refine(wrong, matches, world.pose, (50.0, 50.0))
+        step, sigma = focal_step(best, matches, (50.0, 50.0))
+        assert sigma < 0.01
+        assert step == pytest.approx(-np.log(factor), abs=5.0 * sigma)
+        assert refine(wrong, matches, world.pose, (50.0, 50.0), "focal").camera.params[:2] == pytest.approx(
+            CAMERA.params[:2], rel=5.0 * sigma
+        )
+
+
+def test_the_stated_deviation_of_a_focal_length_is_true():
+    rng = np.random.default_rng(11)
+    squares = []
+    for _ in range(100):
+        world, matches = noisy(rng, 60, 10)
+        best = refine(CAMERA, matches, world.pose, max_errors(matches))
+        step, sigma = focal_step(best, matches, max_errors(matches))
+        squares.append((step / sigma) ** 2)
+    # The sum is chi-square with 100 degrees: 0.999 of such are between 60 and 153. The variance is estimated besides.
+    assert 0.6 < np.mean(squares) < 1.53
+
+
+def test_a_plane_seen_from_the_front_tells_no_focal_length():
+    rng = np.random.default_rng(13)
+    X = np.column_stack([rng.uniform(-2, 2, (100, 2)), np.full(100, 5.0)])
+    pose = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    pixels = project(CAMERA, pose, X) + rng.normal(0.0, 0.7, (100, 2))
+    matches = Matches(pixels, X).with_sigma(0.7)
+    wrong = scaled(1.1)
+    best = refine(wrong, matches, pose + 0.5 * np.eye(7)[6], max_errors(matches))
+    step, sigma = focal_step(best, matches, max_errors(matches))
+    assert sigma > 0.05
+    found = estimate_absolute_pose(wrong, pixels, X, sigma=(0.7, 1.0), options=PoseOptions(look_for_rival=False))
+    assert abs(step) < 5.0 * sigma or found.status == "uncertain"
+
+
+def test_the_most_alike_matches_are_counted():
+    assert closest_of(np.array([0.1, 0.2, 0.3, 0.6]), np.array([0.4, 0.5, 0.7, 0.8])) == (2, 0)
+    assert closest_of(np.array([0.4, 0.5]), np.array([0.1, 0.6])) == (0, 1)
+    assert closest_of(np.zeros(0), np.zeros(0)) == (0, 0)
