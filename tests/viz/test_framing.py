@@ -90,3 +90,14 @@ def test_up():
     np.testing.assert_allclose(upward(np.array([[0.0, 1.0, 0.1], [0.0, 1.0, -0.1]])), [0, -1, 0])
     np.testing.assert_allclose(upward(np.array([[0.0, 1.0, 0], [0.0, -1.0, 0]])), [0, 0, 1])
     np.testing.assert_allclose(upward(np.zeros((0, 3))), [0, 0, 1])
+
+
+@pytest.mark.parametrize("far", [1e40, 1e308])
+def test_points_beyond_single_precision_move_nothing(far):
+    scene = exact_scene()
+    xyz = scene.points.xyz.copy()
+    xyz[0] = [far, -far, far]
+    with np.errstate(over="ignore", invalid="ignore"):
+        view = _view(scene.with_points(xyz))
+    assert np.isfinite(view.camera_size)
+    assert view.distance == pytest.approx(_view(scene).distance, rel=0.1)  # one of twelve points is not in it

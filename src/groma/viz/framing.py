@@ -97,8 +97,8 @@ def horizontal(up: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _finite(places: FloatArray) -> FloatArray:
-    """Items (N, k, 3) whose places are all known."""
-    return places[np.isfinite(places).all(axis=(1, 2))]
+    """Items (N, k, 3) whose places are all known, and within single precision, in which a page holds them."""
+    return places[(np.abs(places) <= np.finfo(np.float32).max).all(axis=(1, 2))]
 
 
 def _near(distances: FloatArray, share: float, far: float) -> BoolArray:
