@@ -211,13 +211,6 @@ def together(*functions: Callable[[], Any]) -> tuple[Any, ...]:
     return tuple(map_in_threads(_called, functions))
 
 
-def begun(function: Callable[[], _Result]) -> Callable[[], _Result]:
-    """Begin a call in a thread of this process, and return what waits for its result; without workers that calls it."""
-    crew = _CREW.get()
-    executor = None if crew is None else crew.here.executor
-    return function if executor is None else executor.submit(function).result
-
-
 @contextmanager
 def beside(function: Callable[[], object]) -> Iterator[None]:
     """Call a function in a thread of this process while the block goes on; without workers, when it has ended.

@@ -138,7 +138,7 @@ def test_many_planes_are_found():
 
 @pytest.mark.kernels
 def test_the_same_planes_with_any_number_of_threads():
-    """Bit by bit, though more candidates are grown than one after the other would be, and others are thrown away."""
+    """Bit by bit: candidates are scored in pieces."""
     points, segments = room(np.random.default_rng(11))
     noise = np.broadcast_to(SIGMA**2 * np.eye(3), (len(segments), 2, 3, 3))
     alone = find_planes(points, noise_of(points), segments, noise)

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from _wireframe import arc, random_lines, wireframe
 
-from groma.execution import available_cores, begun, beside, map_ranges, map_work, num_workers, work_with
+from groma.execution import available_cores, beside, map_ranges, map_work, num_workers, work_with
 from groma.mapping.lines.build import MapLinesOptions, map_lines
 
 
@@ -166,27 +166,6 @@ if __name__ == "__main__":
         number = ranks.num_workers
         same_lines_as_alone(ranks)
         print(number, "workers agree")
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_what_was_begun_is_waited_for(threads):
-    """The result, and what was raised, whoever did it; with threads the caller goes on meanwhile."""
-    caller, others, may_end = threading.current_thread(), [], threading.Event()
-
-    def work():
-        others.append(threading.current_thread() is not caller)
-        return may_end.wait(10.0)
-
-    def fails():
-        raise KeyError("inside")
-
-    with work_with(threads):
-        result, failed = begun(work), begun(fails)
-        may_end.set()
-        assert result()
-        with pytest.raises(KeyError, match="inside"):
-            failed()
-    assert others == [threads > 1]
 
 
 ARENAS = """

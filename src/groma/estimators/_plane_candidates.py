@@ -23,8 +23,9 @@ from groma.geometry.algebra import dot, norm
 
 #: Pairs looked at together (cost: memory).
 _CHUNK = 4096
-#: Candidates that are worth a thread, and pieces for each, as some take longer than others (cost: time only).
-_SCORED_AT_ONCE, _PIECES = 8, 8
+#: Candidates that are worth a thread: one takes a hundredth of a millisecond, and handing over a tenth. And pieces for
+#: each thread, as some candidates take longer than others (cost: time only).
+_SCORED_AT_ONCE, _PIECES = 256, 8
 
 
 @dataclass(frozen=True)

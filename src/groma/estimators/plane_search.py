@@ -21,8 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
-from heapq import heapify, heappop, heappush, nsmallest
+from heapq import heapify, heappop, heappush
 
 import numpy as np
 
@@ -31,7 +30,6 @@ from groma.errors import InputError, ShapeError
 from groma.estimators._plane_candidates import Features, Scores, features_of, from_neighbours, from_segments
 from groma.estimators._plane_growth import Grower, Grown, connected_to
 from groma.estimators._plane_options import PLANE_SEARCH, PlaneOptions
-from groma.execution import begun, num_threads
 from groma.gates import chi_square_gate
 from groma.geometry.algebra import vectors
 
@@ -39,8 +37,6 @@ from groma.geometry.algebra import vectors
 BAND = PLANE_SEARCH.band
 #: Candidates whose scores are brought up to date together (cost: time only).
 _SCORED_TOGETHER = 16
-#: What a candidate grows to, as :meth:`Grower.grow` returns it.
-_Grown = tuple[Grown | None, FloatArray, IntArray]
 
 
 @dataclass(frozen=True)
@@ -175,7 +171,7 @@ def _extract(
     alive = (support >= 0.5 * options.min_support) & (score >= least_score)
     queue = [(-float(score[k]), int(k)) for k in np.flatnonzero(alive)]
     heapify(queue)
-    growth = _Growth(features, gate, float(log_tried), options, candidates, homes)
+    grower = Grower(features, gate, float(log_tried), options)
     failures, scored = 0, np.zeros(len(candidates), np.int64)
     patience = max(PLANE_SEARCH.patience, len(candidates) // PLANE_SEARCH.candidates_per_failure)
     at = np.argsort(homes, kind="stable")
@@ -201,11 +197,8 @@ def _extract(
             continue
         alive[best] = False
         failures += 1
-        few = growth.at_once - 1  # the least so many of a heap are among its first so many levels
-        after = nsmallest(few, queue[: 2**few - 1])
-        grown, plane, rows = growth.of(best, [k for _, k in after if alive[k]], labels)
+        grown, plane, rows = grower.grow(candidates[best], int(homes[best]), labels)
         if grown is not None:
-            growth.forget()
             failures = 0
             labels[grown.taken] = len(found)
             found.append(grown)
@@ -224,46 +217,6 @@ def _are_other_planes(features: Features, candidates: FloatArray, plane: FloatAr
     some = features.places[rows[:: max(1, len(rows) // 64)]]
     height = np.abs(some @ candidates[:, :3].T + candidates[:, 3])
     return _median_above(height, PLANE_SEARCH.same * float(np.median(features.spread(plane[:3], rows))))
-
-
-class _Growth:
-    """Grows the next candidates while one is looked at, as if one after the other: what was begun before a plane was
-    taken out is begun again after it.
-    """
-
-    def __init__(
-        self, features: Features, gate: float, log_tried: float, options: PlaneOptions, candidates: FloatArray,
-        homes: IntArray,
-    ) -> None:  # fmt: skip
-        self.at_once = num_threads()
-        self._candidates, self._homes = candidates, homes
-        self._free = [Grower(features, gate, log_tried, options) for _ in range(self.at_once)]
-        self._begun: dict[int, Callable[[], _Grown]] = {}
-
-    def of(self, wanted: int, after: list[int], labels: IntArray) -> _Grown:
-        """Return what a candidate grows to, and begin with others as far as there are threads."""
-        if wanted not in self._begun and not self._free:  # others were begun that were not wanted in the end
-            self._wait()
-        for k in (wanted, *after):
-            if k not in self._begun and self._free:
-                self._begun[k] = begun(partial(self._grow, self._free.pop(), k, labels))
-        return self._begun.pop(wanted)()
-
-    def forget(self) -> None:
-        """Wait for what was begun, and throw it away."""
-        self._wait()
-        self._begun.clear()
-
-    def _grow(self, grower: Grower, k: int, labels: IntArray) -> _Grown:
-        try:
-            return grower.grow(self._candidates[k], int(self._homes[k]), labels)
-        finally:
-            self._free.append(grower)
-
-    def _wait(self) -> None:
-        """Wait for all that was begun."""
-        for result in self._begun.values():
-            result()
 
 
 def _ranges(begin: IntArray, end: IntArray) -> IntArray:
