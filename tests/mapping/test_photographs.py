@@ -38,6 +38,17 @@ def test_every_kind_of_image_is_read_as_it_is_stored(tmp_path):
         assert np.abs(read_gray(path).astype(int) - grey).max() <= 4, path.name
 
 
+@pytest.mark.skipif(os.name == "nt" or os.uname().sysname == "Darwin", reason="such names cannot be made")
+@pytest.mark.parametrize("name", [b"bad\xff.png", b"two\nlines.png", b"in\x1b/a.png"])
+def test_names_that_are_no_text_are_refused(tmp_path, name):
+    path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + name))
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(b"")
+    with pytest.raises(InputError, match=r"cannot stand in a model: it must be UTF-8, in one line. Rename it") as told:
+        image_files(tmp_path)
+    str(told.value).encode()  # can be printed
+
+
 def test_a_jpeg_that_ends_too_early_is_refused(tmp_path):
     noise = np.random.default_rng(0).integers(0, 255, (80, 90), dtype=np.uint8)
     content = cv2.imencode(".jpg", noise)[1].tobytes()

@@ -26,6 +26,11 @@ def stays_inside(name: str) -> bool:
     return way[0] not in ("..", "")
 
 
+def is_text(name: str) -> bool:
+    """Whether a name can stand in any file: it is Unicode, without line breaks and other control characters."""
+    return not any(character < " " or "\ud800" <= character <= "\udfff" for character in name)
+
+
 def listed_file(folder: Path, name: str, place: object) -> Path:
     """Return the path that a list means by a name.
 

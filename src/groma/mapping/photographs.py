@@ -16,7 +16,8 @@ from pathlib import Path
 import cv2
 
 from groma.bounded.images import decoded
-from groma.bounded.names import IMAGES, VIDEOS
+from groma.bounded.names import IMAGES, VIDEOS, is_text
+from groma.bounded.text import shown
 from groma.cameras import model as camera_model
 from groma.errors import FileFormatError, GromaError, InputError
 from groma.execution import map_work
@@ -42,6 +43,11 @@ def image_files(folder: Path) -> list[Path]:
     )
     if not files:
         raise InputError(f"{folder} holds no images ({', '.join(IMAGES)}). Check the path.")
+    wrong = next((name for path in files if not is_text(name := path.relative_to(folder).as_posix())), None)
+    if wrong is not None:
+        raise InputError(
+            f"The name of the image {shown(wrong)} cannot stand in a model: it must be UTF-8, in one line. Rename it."
+        )
     return files
 
 
