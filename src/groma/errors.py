@@ -15,7 +15,7 @@ an error: see :class:`groma.solver.termination.Termination`.
 """
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 
 class GromaError(Exception):
@@ -40,6 +40,18 @@ class ProblemError(InputError):
 
 class OutputError(GromaError, OSError):
     """A result could not be written."""
+
+
+def causes_of(error: BaseException | None) -> Iterator[BaseException]:
+    """Yield an error and what it came from."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def is_interrupt(error: BaseException) -> bool:
+    """Whether an error came from Ctrl-C: a package that it ends the import of says that it cannot be imported."""
+    return any(isinstance(one, KeyboardInterrupt) for one in causes_of(error))
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -14,6 +14,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from groma.errors import is_interrupt
 from groma.io.trajectories import Trajectory
 from groma.solver.report import SolveReport
 from groma.tracking.backend.mapper import Mapper, Present
@@ -72,11 +73,10 @@ class Ending:
             kept[number] = kept[number].copy()
         try:
             return step()
-        except KeyboardInterrupt:
-            self._interrupted = True
-            self.warnings.append(f"Interrupted at the end of the track: {what}. This and what follows was left out.")
-        except Exception as error:
-            self.warnings.append(_left_out(what, error))
+        except (KeyboardInterrupt, Exception) as error:
+            self._interrupted = is_interrupt(error)
+            interrupted = f"Interrupted at the end of the track: {what}. This and what follows was left out."
+            self.warnings.append(interrupted if self._interrupted else _left_out(what, error))
         mapper.abandon()
         mapper.maps, mapper.current = kept, current
         return otherwise
@@ -150,14 +150,14 @@ class Ending:
         """Return what a step gives that is needed after an interruption too."""
         try:
             return step()
-        except KeyboardInterrupt:
-            return step()
-        except Exception as error:
+        except (KeyboardInterrupt, Exception) as error:
+            if is_interrupt(error):
+                return step()
             self.warnings.append(_left_out(what, error))
             return otherwise
 
 
-def _left_out(what: str, error: Exception) -> str:
+def _left_out(what: str, error: BaseException) -> str:
     return (
         f"Left out at the end of the track: {what}, which failed ({type(error).__name__}: {error}). Please report it."
     )

@@ -16,7 +16,7 @@ import numpy as np
 from groma._counted import counted
 from groma._log import log_warnings, logged_stages, logger_of
 from groma.bounded.json_text import json_text
-from groma.errors import GromaError, InputError
+from groma.errors import GromaError, InputError, is_interrupt
 from groma.evaluation.trajectory import TrajectoryScores, score_trajectory
 from groma.io import atomic_output, write_scene
 from groma.io.sequences import Sequence, open_sequence
@@ -337,5 +337,7 @@ def _failure(what: str, step: Callable[[], object]) -> str | None:
     except OSError:
         raise
     except Exception as error:
+        if is_interrupt(error):
+            raise KeyboardInterrupt from None
         return f"Not written: {what}, which failed ({type(error).__name__}: {error}). Please report it."
     return None

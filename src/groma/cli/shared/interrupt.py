@@ -51,7 +51,9 @@ class Interruption:
         """Whether an error may be what an interrupt became on its way: any but a plain one of groma or the system."""
         if not self.asked:
             return False
-        kinds = {type(one).__module__.partition(".")[0] for one in _chain(error)}
+        from groma.errors import causes_of
+
+        kinds = {type(one).__module__.partition(".")[0] for one in causes_of(error)}
         return kinds != {"groma"} and not isinstance(error, OSError)
 
 
@@ -93,10 +95,3 @@ def interruptible() -> Iterator[Interruption]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _chain(error: BaseException | None) -> Iterator[BaseException]:
-    """Yield an error and what it came from."""
-    while error is not None:
-        yield error
-        error = error.__cause__ or error.__context__
