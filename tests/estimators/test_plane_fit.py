@@ -137,6 +137,7 @@ def test_many_planes_are_found():
 
 
 @pytest.mark.kernels
+@pytest.mark.compiled
 def test_the_same_planes_with_any_number_of_threads():
     """Bit by bit: candidates are scored in pieces."""
     points, segments = room(np.random.default_rng(11))
