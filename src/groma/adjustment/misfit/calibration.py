@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._counted import counted
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.cameras import model as camera_model
 from groma.errors import ProblemError
 from groma.gates import gate
@@ -33,15 +33,17 @@ CALIBRATION = CalibrationGates()
 
 def refuse_focal_lengths(scene: Scene) -> None:
     """Raise ProblemError, naming the camera, where one that took an image has no usable focal length."""
-    for row in np.unique(scene.images.camera_idx).tolist():
-        model, params = camera_model(scene.cameras.models[row]), scene.cameras.params_of(row)
-        needed = [*model.focal_indices, *model.known_indices]
-        if (np.isfinite(params[needed]) & (params[needed] > 0.0)).all():
+    cameras, used = scene.cameras, _used(scene)
+    for name, rows in cameras.by_model().items():
+        model = camera_model(name)
+        needed = cameras.params[np.ix_(rows, [*model.focal_indices, *model.known_indices])]
+        bad = used[rows] & ~(np.isfinite(needed) & (needed > 0.0)).all(axis=1)
+        if not bad.any():
             continue
         what = "focal lengths" if model.is_planar else "width and height"
         raise ProblemError(
-            f"Camera {scene.cameras.ids[row]} ({model.name}) needs positive {what} in pixels; got "
-            f"{params[needed].tolist()}. Correct them in the scene's cameras."
+            f"Camera {cameras.ids[rows[bad][0]]} ({model.name}) needs positive {what} in pixels; got "
+            f"{needed[bad][0].tolist()}. Correct them in the scene's cameras."
         )
 
 
@@ -51,9 +53,9 @@ def doubtful_cameras(scene: Scene) -> tuple[str, ...]:
     BAL files have no image sizes; nothing is said of their cameras.
     """
     cameras = scene.cameras
-    used = np.zeros(len(cameras), bool)
-    used[scene.images.camera_idx] = True
-    used &= np.array([name != "BAL" for name in cameras.models], bool)
+    used = _used(scene) & np.array([name != "BAL" for name in cameras.models], bool)
+    if not used.any():
+        return ()
     sized = (cameras.width > 0) & (cameras.height > 0)
     said = []
     if len(unsized := np.flatnonzero(used & ~sized)):
@@ -71,6 +73,13 @@ def doubtful_cameras(scene: Scene) -> tuple[str, ...]:
             "Give the cameras the size and parameters that belong to the photographs."
         )
     return tuple(said)
+
+
+def _used(scene: Scene) -> BoolArray:
+    """Which cameras took an image."""
+    used = np.zeros(len(scene.cameras), bool)
+    used[scene.images.camera_idx] = True
+    return used
 
 
 def _share_outside(scene: Scene) -> FloatArray:
