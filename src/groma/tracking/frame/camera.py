@@ -8,13 +8,13 @@ corner of the image (first pixel's centre at 0.5, 0.5); OpenCV's do not, and are
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray
 from groma.cameras import model as camera_model
 from groma.errors import InputError
-from groma.geometry import quaternion
 from groma.io.sequences.frame import SequenceCamera
 from groma.localization.pose.camera import QueryCamera
 
@@ -63,6 +63,11 @@ class TrackCamera:
     def matrix_opencv(self) -> FloatArray:
         """(3, 3) calibration matrix in OpenCV's pixels."""
         return np.array([[self.fx, 0, self.cx - 0.5], [0, self.fy, self.cy - 0.5], [0, 0, 1.0]])
+
+    @property
+    def pinhole(self) -> dict[str, Any]:
+        """The same camera, as PoseLib wants it."""
+        return {"model": PINHOLE, "width": self.width, "height": self.height, "params": self.params.tolist()}
 
     @property
     def query(self) -> QueryCamera:
@@ -120,7 +125,12 @@ class TrackCamera:
 
 def rotation(pose: FloatArray) -> FloatArray:
     """(3, 3) rotation matrix of one pose (7,)."""
-    return quaternion.to_matrix(pose[:4])
+    x, y, z, w = pose[:4].tolist()  # numbers of Python are quicker here than arrays of one
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
 
 
 def into(pose: FloatArray, points: FloatArray) -> FloatArray:

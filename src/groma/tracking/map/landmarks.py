@@ -27,15 +27,15 @@ class _Growing:
         self._arrays = {
             name: np.full((64, *shape), fill, dtype) for name, (shape, dtype, fill) in self._columns.items()
         }
+        self._show_rows()
 
     def __len__(self) -> int:
         return self.count
 
-    def __getattr__(self, name: str) -> np.ndarray:
-        arrays = self.__dict__.get("_arrays", {})
-        if name in arrays:
-            return arrays[name][: self.count]
-        raise AttributeError(name)
+    def _show_rows(self) -> None:
+        """Make the rows in use the attributes that are named as the columns."""
+        for name, array in self._arrays.items():
+            setattr(self, name, array[: self.count])
 
     def extend(self, count: int) -> IntArray:
         """Add ``count`` rows and return their indices."""
@@ -48,12 +48,14 @@ class _Growing:
                 self._arrays[name] = larger
         rows = np.arange(self.count, need)
         self.count = need
+        self._show_rows()
         return rows
 
     def copy(self) -> Self:
         """Return a table of its own with the same rows."""
         out = type(self)()
         out.count, out._arrays = self.count, {name: array.copy() for name, array in self._arrays.items()}
+        out._show_rows()
         return out
 
     @property
