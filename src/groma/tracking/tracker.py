@@ -263,7 +263,7 @@ class Tracker:
         tracks = present.followed.points
         tracks = tracks.take(points.alive[tracks.index])
         better = turned_prediction(
-            self.camera, present.data.gray, data.gray, (tracks.pixel, points.xyz[tracks.index]),
+            self.camera, present.data.small, data.small, (tracks.pixel, points.xyz[tracks.index]),
             partial(present.data.spread_places, present.pose), present.pose, predicted, gates,
         )  # fmt: skip
         if better is None:

@@ -22,6 +22,7 @@ from groma.features.point_tracks import corners
 from groma.features.segments import Segments
 from groma.io.sequences.frame import Frame
 from groma.tracking.frame.camera import TrackCamera, back
+from groma.tracking.frame.coarse_alignment import SmallImage, small_image
 from groma.tracking.frame.depth import DepthImage, depth_sigma, segment_inverse_depths
 from groma.tracking.frame.planes import FramePlanes, frame_planes
 from groma.tracking.frame.rectification import (
@@ -154,7 +155,8 @@ class FrameFeatures:
         """Begin in other threads with what depends on this image alone; with what a search needs where one is given."""
         if self.frame.right is not None:  # how that camera is turned may become known better meanwhile
             return
-        pool.submit(getattr, self, "planes")
+        for name in ("planes", "small"):
+            pool.submit(getattr, self, name)
         if searching is not None:
             self.prepare(searching)
 
@@ -164,6 +166,11 @@ class FrameFeatures:
             if not future.cancel():
                 future.result()
         self._work.clear()
+
+    @_FoundOnce
+    def small(self) -> SmallImage:
+        """A small image, which tells how the camera turned."""
+        return small_image(self.gray, self.options.gates.turns)
 
     @_FoundOnce
     def planes(self) -> FramePlanes | None:
