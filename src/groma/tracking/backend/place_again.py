@@ -23,13 +23,13 @@ from groma.localization.pose.refinement import refine
 from groma.mapping.noise.landmarks import point_noise
 from groma.tracking.backend.loop_closure import agreeing_pose, join_lines
 from groma.tracking.frame.camera import TrackCamera, into, rotation
+from groma.tracking.frame.descriptor_pairs import PlacedFeatures
 from groma.tracking.frame.measurements import PointMeasurements
 from groma.tracking.gates import TrackingGates
 from groma.tracking.map.landmarks import ALIVE
 from groma.tracking.map.lines import assign, expected_segments
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.options import TrackOptions
-from groma.tracking.frame.descriptor_pairs import PlacedFeatures
 from groma.tracking.pose.relocalise import KnownFeatures, known_features, match_near
 from groma.tracking.result import map_to_scene
 
