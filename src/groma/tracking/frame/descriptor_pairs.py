@@ -58,6 +58,8 @@ def _best_near(expected, first, pixel, second, order, begin, band, radius, max_b
                 differ = np.int64(0)
                 for word in range(words):
                     differ += _count_bits(first[i, word] ^ second[j, word])
+                    if differ > max_bits:
+                        break
                 if differ > max_bits:
                     continue
                 number = order[j]

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, replace
+from functools import cache
 from threading import RLock
 from typing import Any, Generic, TypeVar, overload
 
@@ -301,11 +302,14 @@ def segment_noise(gates: DepthGates = DEFAULT.depth) -> DepthNoise:
     return DepthNoise(gates.min_sigma, gates.inverse_sigma, 0.0, correlation=gates.correlation, tilt=0.0, shift=0.0)
 
 
+@cache
 def grid_pixels(camera: TrackCamera, gates: DepthGates = DEFAULT.depth) -> FloatArray:
-    """Pixels (N, 2) of an even grid over the image, row by row: the middles of cells."""
+    """Pixels (N, 2) of an even grid over the image, row by row: the middles of cells. It cannot be written to."""
     rows, columns = grid_shape(camera, gates)
     v, u = np.mgrid[0:rows, 0:columns].reshape(2, -1)
-    return (np.column_stack([u, v]) + 0.5) * (camera.width / columns, camera.height / rows)
+    pixels = (np.column_stack([u, v]) + 0.5) * (camera.width / columns, camera.height / rows)
+    pixels.flags.writeable = False
+    return pixels
 
 
 def grid_shape(camera: TrackCamera, gates: DepthGates = DEFAULT.depth) -> tuple[int, int]:

@@ -21,6 +21,7 @@ class _Growing:
     """Arrays of one length that double when they are full."""
 
     _columns: dict[str, tuple[tuple[int, ...], type, float]]
+    state: np.ndarray
 
     def __init__(self) -> None:
         self.count = 0
@@ -65,7 +66,7 @@ class _Growing:
 
 
 class PointTable(_Growing):
-    """Points: place, where their patch is kept, how often they were looked for and found, and the plane they lie on."""
+    """Points: place, where their patch is kept, how often they were missed, and the plane they lie on."""
 
     _columns = {  # noqa: RUF012
         "xyz": ((3,), np.float64, 0.0),
@@ -74,8 +75,6 @@ class PointTable(_Growing):
         "pixel": ((2,), np.float64, 0.0),
         "first_keyframe": ((), np.int64, -1),
         "first_pixel": ((2,), np.float64, 0.0),
-        "visible": ((), np.int32, 0),
-        "found": ((), np.int32, 0),
         "misses": ((), np.int32, 0),
         "plane": ((), np.int64, -1),
         "plane_sigma": ((), np.float64, 0.0),
@@ -86,8 +85,6 @@ class PointTable(_Growing):
     pixel: FloatArray
     first_keyframe: IntArray
     first_pixel: FloatArray
-    visible: IntArray
-    found: IntArray
     misses: IntArray
     plane: IntArray
     plane_sigma: FloatArray
@@ -103,8 +100,6 @@ class LineTable(_Growing):
         "strength": ((), np.float64, 0.0),
         "first_keyframe": ((), np.int64, -1),
         "first_ends": ((4,), np.float64, 0.0),
-        "visible": ((), np.int32, 0),
-        "found": ((), np.int32, 0),
         "plane": ((), np.int64, -1),
         "plane_sigma": ((), np.float64, 0.0),
     }
@@ -114,8 +109,6 @@ class LineTable(_Growing):
     strength: FloatArray
     first_keyframe: IntArray
     first_ends: FloatArray
-    visible: IntArray
-    found: IntArray
     plane: IntArray
     plane_sigma: FloatArray
 

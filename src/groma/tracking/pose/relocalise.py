@@ -10,7 +10,9 @@ with them, and the best are estimated from all that agrees: points, lines and pl
 from __future__ import annotations
 
 import math
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -19,6 +21,7 @@ from groma.geometry import se3
 from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import Straight, propose
 from groma.localization.pose.matches import Matches
+from groma.tracking.beside import beside
 from groma.tracking.frame.camera import TrackCamera, back, into
 from groma.tracking.frame.descriptor_pairs import PlacedFeatures, pair_anywhere, pair_near
 from groma.tracking.frame.features import Descriptors, FrameFeatures
@@ -148,11 +151,16 @@ def find_pose(
     guesses: list[FloatArray],
     predicted: FloatArray,
     prior_sigma: FloatArray,
+    pool: Executor | None = None,
 ) -> Found | None:
-    """Find the pose of a frame near some keyframes; ``guesses`` are poses to be tried as well."""
+    """Find the pose of a frame near some keyframes; ``guesses`` are poses to be tried as well.
+
+    What the first keyframe proposes hangs on no guess, and is worked out in a pool.
+    """
     search = _Search(track_map, camera, data, known_features(track_map, camera, keyframes), predicted, prior_sigma)
     gates = data.options.gates
     strong = gates.verification.strong
+    first = beside(pool, partial(search.proposal, keyframes[0]))
     best: Found | None = None
     for guess in search.in_order(guesses):
         near = search.proposal_near(guess)
@@ -162,7 +170,7 @@ def find_pose(
     if best is not None and best.score >= strong:
         # What repeats itself agrees with a wrong guess, too; what no guess suggests may agree with more.
         keyframes = keyframes[:1]
-    others = [search.proposal(keyframe) for keyframe in keyframes]
+    others = [first(), *(search.proposal(keyframe) for keyframe in keyframes[1:])]
     return search.best_of([pose for pose in others if pose is not None], gates.finding.max_refined)
 
 
