@@ -377,6 +377,7 @@ class Tracker:
         adjusted = ending.adjust(main).numbers(self.camera)  # finds planes, which are counted
         statistics = self.statistics() | adjusted
         whole, *submaps = [ending.submap(root) for root in (main, *others)]
+        statistics |= {kind: len(getattr(whole.scene, kind)) for kind in ("points", "lines", "planes")}  # as written
         warnings = [*self._checks.warnings, *ending.warnings]
         if not history.entries:
             warnings.append("No map was made: no frame could be used, or the camera did not move enough to start.")
