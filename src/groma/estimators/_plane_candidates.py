@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -48,6 +49,13 @@ class Features:
     #: radius, a bound of the variances.
     order: IntArray
     balls: FloatArray
+
+    @property
+    def arrays(self) -> tuple[Any, ...]:
+        """What loops take."""
+        return (
+            self.places, self.packed, self.spacing, self.partner, self.carrier, self.neighbours, self.order, self.balls
+        )  # fmt: skip
 
     def spread(self, normal: FloatArray, rows: IntArray | slice = slice(None)) -> FloatArray:
         """Standard deviations along a normal."""
