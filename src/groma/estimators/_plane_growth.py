@@ -17,17 +17,47 @@ from groma.estimators._plane_loops import (
     connected_loop,
     connected_part_loop,
     fit_loop,
-    heights_loop,
+    height_kernel,
     layer_loop,
     near_free_loop,
     near_loop,
-    tilt_loop,
+    variance_kernel,
 )
 from groma.estimators._plane_options import PLANE_SEARCH as GATES
 from groma.estimators._plane_options import PlaneOptions
 from groma.estimators.association import MAX_SQUARE, ROUNDS, log10_poisson_tail, maximise_loop
 from groma.estimators.plane_fit import PlaneFit, fit_plane
 from groma.geometry.algebra import norm
+
+
+@loop
+def heights_loop(features, rows, plane, height, spread):
+    """Signed distances (M,) of rows from a plane, and their standard deviations (M,)."""
+    places, packed = features[0], features[1]
+    for k in range(len(rows)):
+        i = rows[k]
+        height[k] = height_kernel(places[i], plane)
+        spread[k] = math.sqrt(max(variance_kernel(packed[i], plane[0], plane[1], plane[2]), 1e-300))
+
+
+@loop
+def tilt_loop(places, rows, plane, center, precision):
+    """Largest variance of the normal of a plane fitted to rows (M,) with some precisions (M,), square radians."""
+    s00 = s01 = s02 = s11 = s12 = s22 = 0.0
+    for k in range(len(rows)):
+        i, p = rows[k], precision[k]
+        x, y, z = places[i, 0] - center[0], places[i, 1] - center[1], places[i, 2] - center[2]
+        s00, s01, s02 = s00 + p * x * x, s01 + p * x * y, s02 + p * x * z
+        s11, s12, s22 = s11 + p * y * y, s12 + p * y * z, s22 + p * z * z
+    # Of the three eigenvalues that of the normal is left out: the sum and the product of the other two.
+    a, b, c = plane[0], plane[1], plane[2]
+    total = s00 + s11 + s22 - variance_kernel((s00, s01, s02, s11, s12, s22), a, b, c)
+    minors = s11 * s22 - s12 * s12, s02 * s12 - s01 * s22, s01 * s12 - s02 * s11
+    others = s00 * s22 - s02 * s02, s01 * s02 - s00 * s12, s00 * s11 - s01 * s01
+    product = variance_kernel(minors + others, a, b, c)
+    if not product > 0.0:
+        return np.inf
+    return (0.5 * total + math.sqrt(max(0.25 * total * total - product, 0.0))) / product
 
 
 @loop
@@ -130,8 +160,8 @@ class Grown:
     share: float
     band: float
     log10_false_alarms: float
-    #: The features on it, and those taken out with it.
-    rows: IntArray
+    #: (M, 3) where the features on it are, and all features that are taken out with it.
+    places: FloatArray
     taken: IntArray
 
 
@@ -187,7 +217,7 @@ class Grower:
         fit = fit_plane(features.places[layer], features.covariances[layer], self._weight[:count])
         # The whole layer is taken out: relief so near to a plane cannot be told from it.
         taken = np.union1d(rows, layer[labels[layer] < 0])
-        return Grown(fit, share, band, alarm, rows, taken), plane, rows
+        return Grown(fit, share, band, alarm, features.places[rows], taken), plane, rows
 
     def _log10_false_alarms(self, plane: FloatArray, rows: IntArray) -> float:
         """Number of planes tried on which as much would lie by chance, of their neighbourhood, base-10 logarithm."""

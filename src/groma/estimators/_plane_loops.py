@@ -2,11 +2,10 @@
 """Loops of the plane search over points with packed covariances: fit, selection by distance, connected parts.
 
 Covariances are packed as (xx, xy, xz, yy, yz, zz). ``features`` is the tuple of arrays of
-:class:`groma.estimators._plane_candidates.Features`, ``rows`` are the points that take part, in those arrays. ``mark``
-arrays have an entry per point, -1 on entry and again on return. ``order`` lists all points, near ones together; each
-``BALL`` of them share a row of ``balls``: center, radius, and a bound of the variances. Balls that a plane does not come
-near are passed over, so that the loops look at what is near it, not at the whole scene. Rows are in that order, too;
-this makes a tree of boxes around each few of them a good one for what is nearest.
+:class:`groma.estimators._plane_candidates.Features`, in which near points are together; ``rows`` are the points that
+take part, in their order. ``mark`` arrays have an entry per point, -1 on entry and again on return. Each ``BALL``
+points share a row of ``balls``: center, radius, and a bound of the variances. Balls that a plane does not come near are
+passed over, so that the loops look at what is near it, not at the whole scene.
 """
 
 from __future__ import annotations
@@ -130,36 +129,6 @@ def fit_loop(places, packed, rows, weight, iterations, plane, center, precision)
 
 
 @loop
-def heights_loop(features, rows, plane, height, spread):
-    """Signed distances (M,) of rows from a plane, and their standard deviations (M,)."""
-    places, packed = features[0], features[1]
-    for k in range(len(rows)):
-        i = rows[k]
-        height[k] = height_kernel(places[i], plane)
-        spread[k] = math.sqrt(max(variance_kernel(packed[i], plane[0], plane[1], plane[2]), 1e-300))
-
-
-@loop
-def tilt_loop(places, rows, plane, center, precision):
-    """Largest variance of the normal of a plane fitted to rows (M,) with some precisions (M,), square radians."""
-    s00 = s01 = s02 = s11 = s12 = s22 = 0.0
-    for k in range(len(rows)):
-        i, p = rows[k], precision[k]
-        x, y, z = places[i, 0] - center[0], places[i, 1] - center[1], places[i, 2] - center[2]
-        s00, s01, s02 = s00 + p * x * x, s01 + p * x * y, s02 + p * x * z
-        s11, s12, s22 = s11 + p * y * y, s12 + p * y * z, s22 + p * z * z
-    # Of the three eigenvalues that of the normal is left out: the sum and the product of the other two.
-    a, b, c = plane[0], plane[1], plane[2]
-    total = s00 + s11 + s22 - variance_kernel((s00, s01, s02, s11, s12, s22), a, b, c)
-    minors = s11 * s22 - s12 * s12, s02 * s12 - s01 * s22, s01 * s12 - s02 * s11
-    others = s00 * s22 - s02 * s02, s01 * s02 - s00 * s12, s00 * s11 - s01 * s01
-    product = variance_kernel(minors + others, a, b, c)
-    if not product > 0.0:
-        return np.inf
-    return (0.5 * total + math.sqrt(max(0.25 * total * total - product, 0.0))) / product
-
-
-@loop
 def near_loop(features, rows, plane, limit, out):
     """Write the rows whose squared distance from a plane is below ``limit`` variances; return how many."""
     count, places, packed = 0, features[0], features[1]
@@ -173,14 +142,13 @@ def near_loop(features, rows, plane, limit, out):
 @loop
 def near_free_loop(features, labels, plane, limit, out):
     """As :func:`near_loop`, of all points without a label."""
-    places, packed, _, _, _, _, order, balls = features
+    places, packed, balls = features[0], features[1], features[6]
     count = 0
     for b in range(len(balls)):
         height = abs(height_kernel(balls[b], plane)) - balls[b, 3]
         if height > 0.0 and height * height >= limit * balls[b, 4]:
             continue
-        for k in range(b * BALL, min((b + 1) * BALL, len(order))):
-            i = order[k]
+        for i in range(b * BALL, min((b + 1) * BALL, len(places))):
             if labels[i] < 0 and lies_on_kernel(i, places, packed, plane, limit):
                 out[count] = i
                 count += 1
@@ -190,13 +158,12 @@ def near_free_loop(features, labels, plane, limit, out):
 @loop
 def layer_loop(features, plane, band, out):
     """Write the points nearer to a plane than ``band``; return how many."""
-    places, _, _, _, _, _, order, balls = features
+    places, balls = features[0], features[6]
     count = 0
     for b in range(len(balls)):
         if abs(height_kernel(balls[b], plane)) - balls[b, 3] >= band:
             continue
-        for k in range(b * BALL, min((b + 1) * BALL, len(order))):
-            i = order[k]
+        for i in range(b * BALL, min((b + 1) * BALL, len(places))):
             if abs(height_kernel(places[i], plane)) < band:
                 out[count] = i
                 count += 1
@@ -307,7 +274,7 @@ def linked_loop(features, rows, rank, reach, mark, parent):
     Two are linked if one is among the nearest ``rank`` of the other and not farther than ``reach`` times the larger of
     their spacings, and if they are the two ends of a segment. ``mark`` holds the position of each row.
     """
-    places, _, spacing, partner, _, neighbours, _, _ = features
+    places, _, spacing, partner, _, neighbours, _ = features
     number, width, widest = len(rows), min(rank + 1, len(rows)), 0.0
     nearest, squared = np.empty(width, np.int64), np.empty(width)
     points, boxes = np.empty((number, 3)), np.empty((0, 6))
@@ -381,7 +348,7 @@ def connected_part_loop(features, rows, held, rank, reach, mark, out):
 @loop
 def ball_loop(features, rows, center, radius, plane, gate, mark):
     """Support in a ball, and how much would be in the layer by chance; carried points do not count."""
-    places, packed, _, _, carrier, _, order, balls = features
+    places, packed, _, _, carrier, _, balls = features
     squared = radius * radius
     for k in range(len(rows)):
         i = rows[k]
@@ -393,8 +360,7 @@ def ball_loop(features, rows, center, radius, plane, gate, mark):
         x, y, z = balls[b, 0] - center[0], balls[b, 1] - center[1], balls[b, 2] - center[2]
         if x * x + y * y + z * z > (radius + balls[b, 3]) ** 2:
             continue
-        for k in range(b * BALL, min((b + 1) * BALL, len(order))):
-            i = order[k]
+        for i in range(b * BALL, min((b + 1) * BALL, len(places))):
             carried = carrier[i] >= 0
             support = mark[i] >= 0 and not (carried and mark[carrier[i]] >= 0)
             if carried and not support:

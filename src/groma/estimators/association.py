@@ -108,7 +108,9 @@ def maximise_shares(
     The share of all structures together counts ``pooled`` features in that of each.
     """
     together, probability = np.full(1, 0.5), np.zeros(len(density))
-    maximise_loop(density, clutter, np.zeros_like(owner), np.array([len(owner)]), 1.0, 0.5, rounds, together, probability)
+    maximise_loop(
+        density, clutter, np.zeros_like(owner), np.array([len(owner)]), 1.0, 0.5, rounds, together, probability
+    )
     share, count = np.full(num, float(together[0])), np.bincount(owner, minlength=num)
     maximise_loop(density, clutter, owner, count, pooled, float(together[0]), rounds, share, probability)
     return share
