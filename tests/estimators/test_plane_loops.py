@@ -37,7 +37,7 @@ def test_nearest_points_are_those_of_all(number):
         for place in rng.normal(size=(12, 3)):
             nearest, squared = np.empty(5, np.int64), np.empty(5)
             home = int(rng.integers(number))
-            count = nearest_loop(points, boxes, *place.tolist(), home, bound, nearest, squared)
+            count = nearest_loop(points, boxes, place, home, bound, nearest, squared)
             distance = ((points - place) ** 2).sum(axis=1)
             expected = np.argsort(distance)[:5]
             expected = expected[distance[expected] < bound]
@@ -48,7 +48,7 @@ def test_nearest_points_are_those_of_all(number):
 def test_points_at_one_place_are_not_looked_at_again_and_again():
     points = np.zeros((100, 3))
     nearest, squared = np.empty(3, np.int64), np.empty(3)
-    assert nearest_loop(points, boxes_loop(points), 0.0, 0.0, 0.0, 50, 1.0, nearest, squared) == 3
+    assert nearest_loop(points, boxes_loop(points), np.zeros(3), 50, 1.0, nearest, squared) == 3
     assert (nearest // 8 == 50 // 8).all() and not squared.any()
 
 

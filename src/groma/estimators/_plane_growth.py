@@ -25,7 +25,7 @@ from groma.estimators._plane_loops import (
 )
 from groma.estimators._plane_options import PLANE_SEARCH as GATES
 from groma.estimators._plane_options import PlaneOptions
-from groma.estimators.association import MAX_SQUARE, ROUNDS, log10_poisson_tail, maximise_loop
+from groma.estimators.association import MAX_SQUARE, ROUNDS, log10_poisson_tail
 from groma.estimators.plane_fit import PlaneFit, fit_plane
 from groma.geometry.algebra import norm
 
@@ -61,69 +61,59 @@ def tilt_loop(places, rows, plane, center, precision):
 
 
 @loop
-def _refined_loop(features, labels, gates, options, mark, room, part, plane):
-    """Refine a plane on the part of what lies on it that is connected; ``part`` begins with the first such part.
+def _refined_loop(features, labels, gates, mark, room, numbers, plane):
+    """Refine a plane on the part of what lies on it that is connected; ``room[2]`` begins with the first such part.
 
-    Returns how many features that part has in the end, whether the plane is one until here, and the half thickness of
-    its layer.
+    Returns how many features that part has in the end, and the half thickness of the layer: 0 if it is no plane.
     """
-    places, packed, neighbours = features[0], features[1], features[5]
-    gate, wider, far, link, converged, band, rank, steps, rounds = gates
-    min_support, max_tilt = options
-    num_free, count = 0, neighbours.shape[1]
+    gate, wider, far, link, converged, band, min_support, max_tilt, rank, steps, rounds = gates
+    height, spread, moved, weight, precision = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
     before, center = np.empty(4), np.empty(3)
+    num_free = num_near = 0
+    count = features[5].shape[1]
     for step in range(steps):
-        if step == 1:  # what is far away stays away
-            num_free = near_free_loop(features, labels, plane, far * gate, room[0])
-        # The first rounds reach farther: the candidate is not yet exact.
+        # What is far away stays away. The first rounds reach farther: the candidate is not yet exact.
+        if step < 2:
+            num_free = near_free_loop(features, labels, plane, (far if step == 1 else wider) * gate, room[0])
         limit = (wider if step < 2 else 1.0) * gate
-        if step == 0:
-            num_near = near_free_loop(features, labels, plane, limit, room[1])
-        else:
-            num_near = near_loop(features, room[0, :num_free], plane, limit, room[1])
+        num_near = near_loop(features, room[0, :num_free], plane, limit, room[1])
+        part = room[2]
         count, independent = connected_part_loop(features, room[1, :num_near], part[:count], rank, link, mark, part)
         if independent < min_support:
-            return count, False, 0.0
+            return count, 0.0
         rows = part[:count]
-        height, spread, moved = np.empty(count), np.empty(count), np.empty(count)
-        weight, precision = np.empty(count), np.empty(count)
         heights_loop(features, rows, plane, height, spread)
         for k in range(count):
             # Weights that fall with the distance lead to where the layer is densest, not to the middle of what it
             # cuts off.
             weight[k] = 1.0 / (1.0 + (height[k] / spread[k]) ** 2) ** 2
         copy(plane, before)
-        fit_loop(places, packed, rows, weight, rounds, plane, center, precision)
+        fit_loop(features[0], features[1], rows, weight, rounds, plane, center, precision)
         turned = before[0] * plane[0] + before[1] * plane[1] + before[2] * plane[2]
         heights_loop(features, rows, plane, moved, spread)
-        largest, usual = 0.0, median(spread)
+        largest, usual = 0.0, median(spread[:count])
         for k in range(count):
             largest = max(largest, abs(moved[k] - math.copysign(height[k], turned * height[k])))
-        if step == steps - 1 or (step > 1 and largest < converged * usual):
-            return count, tilt_loop(places, rows, plane, center, precision) <= max_tilt**2, band * usual
-    return count, False, 0.0
+        if step > 1 and largest < converged * usual:
+            break
+    tilt = tilt_loop(features[0], room[2, :count], plane, center, precision)
+    return count, band * median(spread[:count]) if tilt <= max_tilt**2 else 0.0
 
 
 @loop
-def _polished_loop(features, rows, band, gates, mark, layer, weight, plane):
+def _polished_loop(features, rows, band, gates, mark, layer, joined, numbers, plane):
     """Fit a plane to what lies on it in the layer around it, where it is connected; return how much, and its share.
 
     Judged against all that is near, taken or not: what lies on a plane beside this one speaks against it. Membership is
     the weight: all of the plane where it is clean, its densest part where it is not.
     """
     places, packed, spacing = features[0], features[1], features[2]
-    link, inlier, least_share, em_rounds, steps, rounds = gates
-    support, center, share = np.empty((len(rows), 3)), np.empty(3), np.empty(1)
-    for k in range(len(rows)):
-        copy(places[rows[k]], support[k])
-    count = 0
+    link, inlier, least_share, turns, steps, rounds = gates
+    height, spread, density, weight, center = numbers[0], numbers[1], numbers[2], numbers[3], np.empty(3)
+    count, share = 0, 0.5
     for _ in range(steps):
         number = layer_loop(features, plane, band, layer)
-        tested, reach, joined = np.empty((number, 3)), np.empty(number), np.empty(number, np.bool_)
-        for k in range(number):
-            copy(places[layer[k]], tested[k])
-            reach[k] = link * spacing[layer[k]]
-        connected_loop(support, tested, reach, plane, joined)
+        connected_loop(places, rows, places, layer[:number], spacing, link, plane, joined)
         for k in range(len(rows)):
             mark[rows[k]] = k
         count = 0
@@ -133,23 +123,38 @@ def _polished_loop(features, rows, band, gates, mark, layer, weight, plane):
                 count += 1
         for k in range(len(rows)):
             mark[rows[k]] = -1
-        height, spread, density = np.empty(count), np.empty(count), np.empty(count)
         heights_loop(features, layer[:count], plane, height, spread)
         for k in range(count):
             s = max(spread[k], 1e-12 * band)
             density[k] = math.sqrt(2.0 / math.pi) / s * math.exp(-0.5 * min((height[k] / s) ** 2, MAX_SQUARE))
-        share[0] = 0.5
-        clutter, owner = np.full(count, 1.0 / band), np.zeros(count, np.int64)
-        maximise_loop(density, clutter, owner, np.full(1, count), 2.0, 0.5, em_rounds, share, weight)
+        share = 0.5
+        for _ in range(turns):  # as in groma.estimators.association, of one structure
+            total = 0.0
+            for k in range(count):
+                weight[k] = share * density[k] / (share * density[k] + (1.0 - share) / band)
+                total += weight[k]
+            share = (total + 1.0) / (count + 2.0)
         positive = 0
         for k in range(count):
             if not abs(height[k]) < inlier * spread[k]:
                 weight[k] = 0.0
             positive += weight[k] > 0.0
-        if share[0] < least_share or positive < 3:
+        if share < least_share or positive < 3:
             return 0, 0.0
         fit_loop(places, packed, layer[:count], weight, rounds, plane, center, density)
-    return count, share[0]
+    return count, share
+
+
+@loop
+def _grow_loop(features, labels, gates, others, mark, room, joined, numbers, plane):
+    """Refine and polish a plane; return its number of features, half thickness, and what its layer holds and shares."""
+    count, band = _refined_loop(features, labels, gates, mark, room, numbers, plane)
+    inner, share = 0, 0.0
+    if band > 0.0:
+        inner, share = _polished_loop(
+            features, room[2, :count], band, others, mark, room[3], joined, numbers, plane
+        )  # fmt: skip
+    return count, band, inner, share
 
 
 @dataclass(frozen=True)
@@ -184,37 +189,34 @@ class Grower:
         self._features = features
         self._gate, self._log_tried, self._options = gate, log_tried, options
         count = len(features.places)
-        self._mark, self._room, self._weight = np.full(count, -1), np.empty((4, count), np.int64), np.empty(count)
+        self._mark, self._room = np.full(count, -1), np.empty((4, count), np.int64)
+        self._joined, self._numbers = np.empty(count, bool), np.empty((5, count))
+        self._refining = (
+            gate, GATES.wider, GATES.far, GATES.link, GATES.converged, GATES.band, options.min_support,
+            options.max_tilt, GATES.rank, GATES.grow_steps, GATES.fit_rounds,
+        )  # fmt: skip
+        least = GATES.hopeless * options.min_share
+        self._polishing = GATES.link, GATES.inlier, least, ROUNDS, GATES.polish_steps, GATES.fit_rounds
 
     def grow(self, plane: FloatArray, home: int, labels: IntArray) -> tuple[Grown | None, FloatArray, IntArray]:
         """Refine a candidate where it is connected, and judge it: what is kept, where it went, its support.
 
         It grows from the neighbourhood of its ``home``, a feature: what lies on the same plane far away is another's.
         """
-        features, options, arrays = self._features, self._options, self._features.arrays
-        plane, part, layer = plane.copy(), self._room[2], self._room[3]
+        features, options, plane = self._features, self._options, plane.copy()
         first = features.neighbours[home]
-        part[: len(first)] = first
-        gates = (
-            self._gate, GATES.wider, GATES.far, GATES.link, GATES.converged, GATES.band, GATES.rank, GATES.grow_steps,
-            GATES.fit_rounds,
+        self._room[2, : len(first)] = first
+        count, band, inner, share = _grow_loop(
+            features.arrays, labels, self._refining, self._polishing, self._mark, self._room, self._joined,
+            self._numbers, plane,
         )  # fmt: skip
-        count, good, band = _refined_loop(
-            arrays, labels, gates, (options.min_support, options.max_tilt), self._mark, self._room, part, plane
-        )
-        rows = part[:count].copy()
-        if not good:
-            return None, plane, rows
-        least = GATES.hopeless * options.min_share
-        gates = GATES.link, GATES.inlier, least, ROUNDS, GATES.polish_steps, GATES.fit_rounds
-        count, share = _polished_loop(arrays, rows, band, gates, self._mark, layer, self._weight, plane)
-        if count == 0 or share < options.min_share:
+        rows, layer = self._room[2, :count].copy(), self._room[3, :inner]
+        if inner == 0 or share < options.min_share:
             return None, plane, rows
         alarm = self._log10_false_alarms(plane, rows)
         if alarm > np.log10(options.max_false_alarms):
             return None, plane, rows
-        layer = layer[:count]
-        fit = fit_plane(features.places[layer], features.covariances[layer], self._weight[:count])
+        fit = fit_plane(features.places[layer], features.covariances[layer], self._numbers[3, :inner])
         # The whole layer is taken out: relief so near to a plane cannot be told from it.
         taken = np.union1d(rows, layer[labels[layer] < 0])
         return Grown(fit, share, band, alarm, features.places[rows], taken), plane, rows
@@ -249,5 +251,6 @@ def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, pl
     (N,) bool
     """
     connected = np.empty(len(tested), bool)
-    connected_loop(places, tested, GATES.link * spacing, plane, connected)
+    every, each = np.arange(len(places)), np.arange(len(tested))
+    connected_loop(places, every, tested, each, spacing, GATES.link, plane, connected)
     return connected

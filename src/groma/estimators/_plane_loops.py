@@ -195,13 +195,13 @@ def boxes_loop(points):
 
 
 @loop
-def nearest_loop(points, boxes, x, y, z, home, bound, nearest, squared):
+def nearest_loop(points, boxes, place, home, bound, nearest, squared):
     """Write the nearest points to a place whose squared distances are below a bound, as many as there is room for.
 
     Returns how many there are. It begins near the point ``home``, so that most boxes are farther than what is found.
     """
-    count, width = 0, len(nearest)
-    level = 0
+    count, width, level = 0, len(nearest), 0
+    x, y, z = place[0], place[1], place[2]
     while len(boxes) >> (level + 2):
         level += 1
     node, first = 1, home // _BOX
@@ -234,21 +234,24 @@ def nearest_loop(points, boxes, x, y, z, home, bound, nearest, squared):
 
 
 @loop
-def connected_loop(support, tested, reach, plane, out):
-    """Whether tested points (N, 3), projected to a plane, are as near to its support (M, 3) as their reach (N,)."""
-    flat, normal, home = np.empty(support.shape), plane[:3], 0
+def connected_loop(places, rows, tested, which, spacing, link, plane, out):
+    """Whether tested points (N, 3), projected to a plane, are within so many spacings (N,) of some rows of places.
+
+    Only those ``which`` (K,) are tested; ``out`` (K,) is filled.
+    """
+    flat, at, home = np.empty((len(rows), 3)), np.empty(3), 0
     nearest, squared = np.empty(1, np.int64), np.empty(1)
-    for k in range(len(support)):
-        height = height_kernel(support[k], plane)
+    for k in range(len(rows)):
+        height = height_kernel(places[rows[k]], plane)
         for c in range(3):
-            flat[k, c] = support[k, c] - height * normal[c]
+            flat[k, c] = places[rows[k], c] - height * plane[c]
     boxes = boxes_loop(flat)
-    for k in range(len(tested)):
-        height = height_kernel(tested[k], plane)
-        x, y = tested[k, 0] - height * normal[0], tested[k, 1] - height * normal[1]
-        z = tested[k, 2] - height * normal[2]
-        found = nearest_loop(flat, boxes, x, y, z, home, reach[k] ** 2 * _ROUNDING, nearest, squared)
-        out[k] = found > 0 and math.sqrt(squared[0]) <= reach[k]
+    for k in range(len(which)):
+        height, reach = height_kernel(tested[which[k]], plane), link * spacing[which[k]]
+        for c in range(3):
+            at[c] = tested[which[k], c] - height * plane[c]
+        found = nearest_loop(flat, boxes, at, home, reach * reach * _ROUNDING, nearest, squared)
+        out[k] = found > 0 and math.sqrt(squared[0]) <= reach
         if found > 0:
             home = nearest[0]
 
@@ -296,7 +299,7 @@ def linked_loop(features, rows, rank, reach, mark, parent):
             if len(boxes) == 0:
                 boxes = boxes_loop(points)
             bound = (reach * widest) ** 2 * _ROUNDING
-            count = nearest_loop(points, boxes, points[k, 0], points[k, 1], points[k, 2], k, bound, nearest, squared)
+            count = nearest_loop(points, boxes, points[k], k, bound, nearest, squared)
         for m in range(count):
             j = nearest[m]
             x, y, z = points[j, 0] - points[k, 0], points[j, 1] - points[k, 1], points[j, 2] - points[k, 2]

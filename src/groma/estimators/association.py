@@ -32,7 +32,7 @@ MAX_SQUARE = 1400.0
 
 
 @loop
-def maximise_loop(noise, clutter, owner, count, pooled, common, rounds, share, probability):
+def _maximise(noise, clutter, owner, count, pooled, common, rounds, share, probability):
     """Expectation and maximisation, by turns: probabilities (N,) and shares (K,)."""
     total = np.zeros(len(share))
     for _ in range(rounds):
@@ -96,7 +96,7 @@ def inlier_probability(
     share = np.full(len(band), 0.5)
     probability = np.zeros(len(distance))
     # Some features in advance keep small structures from extremes.
-    maximise_loop(noise, clutter, owner.astype(np.int64), count, pooled, common, ROUNDS, share, probability)
+    _maximise(noise, clutter, owner.astype(np.int64), count, pooled, common, ROUNDS, share, probability)
     return probability, share
 
 
@@ -108,11 +108,9 @@ def maximise_shares(
     The share of all structures together counts ``pooled`` features in that of each.
     """
     together, probability = np.full(1, 0.5), np.zeros(len(density))
-    maximise_loop(
-        density, clutter, np.zeros_like(owner), np.array([len(owner)]), 1.0, 0.5, rounds, together, probability
-    )
+    _maximise(density, clutter, np.zeros_like(owner), np.array([len(owner)]), 1.0, 0.5, rounds, together, probability)
     share, count = np.full(num, float(together[0])), np.bincount(owner, minlength=num)
-    maximise_loop(density, clutter, owner, count, pooled, float(together[0]), rounds, share, probability)
+    _maximise(density, clutter, owner, count, pooled, float(together[0]), rounds, share, probability)
     return share
 
 
