@@ -8,8 +8,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from groma.estimators._plane_candidates import features_of
-from groma.estimators._plane_growth import connected_to, tilt_loop
-from groma.estimators._plane_loops import boxes_loop, connected_part_loop, fit_loop, nearest_loop
+from groma.estimators._plane_growth import tilt_loop
+from groma.estimators._plane_loops import boxes_loop, connected_loop, connected_part_loop, fit_loop, nearest_loop
 from groma.estimators.plane_fit import fit_plane, tilt_sigma
 from groma.geometry.algebra import perpendicular
 
@@ -25,6 +25,11 @@ def features_at(places, segments=0):
     if segments:
         carrier[:first:3] = first + 2 * (np.arange(len(carrier[:first:3])) % segments)
     return features_of(places, np.broadcast_to(1e-6 * np.eye(3), (number, 3, 3)), partner, carrier)
+
+
+def linking(features):
+    """What says which features are linked."""
+    return features.places, features.spacing, features.partner, features.carrier, features.neighbours
 
 
 @pytest.mark.parametrize("number", [1, 7, 8, 9, 40, 200])
@@ -75,7 +80,7 @@ def test_connected_part_is_that_of_a_graph(seed):
     expected = rows[label == np.argmax(np.bincount(label, weights=np.isin(rows, held)))]
     carrier = features.carrier[expected]
     mark, part = np.full(200, -1), np.empty(200, np.int64)
-    count, independent = connected_part_loop(features.arrays, rows, held, rank, reach, mark, part)
+    count, independent = connected_part_loop(*linking(features), rows, held, rank, reach, mark, part)
     assert 1 < len(np.unique(label)) and part[:count].tolist() == expected.tolist()
     assert independent == count - np.isin(carrier[carrier >= 0], expected).sum()
     assert (mark == -1).all()
@@ -87,15 +92,15 @@ def test_links_are_as_long_as_is_allowed():
     rows = features.position[24:97:12]
     mark, part = np.full(121, -1), np.empty(121, np.int64)
     assert (features.spacing[rows] == 4.0).all()
-    assert connected_part_loop(features.arrays, rows, rows[:1], 8, 3.0, mark, part)[0] == len(rows)
-    assert connected_part_loop(features.arrays, rows, rows[:1], 8, 2.99, mark, part)[0] == 1
+    assert connected_part_loop(*linking(features), rows, rows[:1], 8, 3.0, mark, part)[0] == len(rows)
+    assert connected_part_loop(*linking(features), rows, rows[:1], 8, 2.99, mark, part)[0] == 1
 
 
 def test_nothing_is_connected_where_nothing_is_held():
     features = features_at(np.random.default_rng(0).normal(size=(50, 3)))
     mark, part, none = np.full(50, -1), np.empty(50, np.int64), np.zeros(0, np.int64)
-    assert connected_part_loop(features.arrays, np.arange(30), none, 8, 3.0, mark, part) == (0, 0)
-    assert connected_part_loop(features.arrays, np.arange(2), np.arange(2), 8, 3.0, mark, part) == (2, 0)
+    assert connected_part_loop(*linking(features), np.arange(30), none, 8, 3.0, mark, part) == (0, 0)
+    assert connected_part_loop(*linking(features), np.arange(2), np.arange(2), 8, 3.0, mark, part) == (2, 0)
 
 
 def test_tilt_is_that_of_the_covariance_of_the_fit():
@@ -121,10 +126,10 @@ def test_connected_is_what_is_near_in_the_projection():
     plane = np.append(np.array([2.0, -1.0, 2.0]) / 3.0, 0.4)
     support, tested, reach = rng.normal(size=(80, 3)), rng.normal(size=(300, 3)), rng.uniform(0.01, 0.5, 300)
     basis = np.stack(perpendicular(plane[:3]), axis=1)
-    distance = KDTree(support @ basis).query(tested @ basis)[0]
-    # connected_to allows three spacings.
-    connected = connected_to(support, tested, reach / 3.0, plane)
-    assert 50 < connected.sum() < 250
-    assert (connected == (distance <= reach)).all()
-    assert not connected_to(np.zeros((0, 3)), tested, reach, plane).any()
-    assert len(connected_to(support, tested[:0], reach[:0], plane)) == 0
+    rows, which, connected = np.arange(0, 80, 2), rng.permutation(300)[:200], np.zeros(200, bool)
+    distance = KDTree(support[rows] @ basis).query(tested[which] @ basis)[0]
+    connected_loop(support, rows, tested, which, reach, 1.5, plane, connected)
+    assert 50 < connected.sum() < 150
+    assert (connected == (distance <= 1.5 * reach[which])).all()
+    connected_loop(support, rows[:0], tested, which, reach, 1.5, plane, connected)
+    assert not connected.any()

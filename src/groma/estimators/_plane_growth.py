@@ -10,6 +10,7 @@ import numpy as np
 
 from groma._numba import loop
 from groma._ordering import copy, median
+from groma._trees import kd_tree
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators._plane_candidates import Features
 from groma.estimators._plane_loops import (
@@ -26,14 +27,13 @@ from groma.estimators._plane_loops import (
 from groma.estimators._plane_options import PLANE_SEARCH as GATES
 from groma.estimators._plane_options import PlaneOptions
 from groma.estimators.association import MAX_SQUARE, ROUNDS, log10_poisson_tail
-from groma.estimators.plane_fit import PlaneFit, fit_plane
-from groma.geometry.algebra import norm
+from groma.estimators.plane_fit import PlaneFit, fit_with_covariance
+from groma.geometry.algebra import norm, perpendicular
 
 
 @loop
-def heights_loop(features, rows, plane, height, spread):
+def heights_loop(places, packed, rows, plane, height, spread):
     """Signed distances (M,) of rows from a plane, and their standard deviations (M,)."""
-    places, packed = features[0], features[1]
     for k in range(len(rows)):
         i = rows[k]
         height[k] = height_kernel(places[i], plane)
@@ -66,53 +66,57 @@ def _refined_loop(features, labels, gates, mark, room, numbers, plane):
 
     Returns how many features that part has in the end, and the half thickness of the layer: 0 if it is no plane.
     """
+    places, packed, spacing, partner, carrier, neighbours, balls = features
     gate, wider, far, link, converged, band, min_support, max_tilt, rank, steps, rounds = gates
     height, spread, moved, weight, precision = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
     before, center = np.empty(4), np.empty(3)
     num_free = num_near = 0
-    count = features[5].shape[1]
+    count = neighbours.shape[1]
     for step in range(steps):
         # What is far away stays away. The first rounds reach farther: the candidate is not yet exact.
         if step < 2:
-            num_free = near_free_loop(features, labels, plane, (far if step == 1 else wider) * gate, room[0])
+            reach = (far if step == 1 else wider) * gate
+            num_free = near_free_loop(places, packed, balls, labels, plane, reach, room[0])
         limit = (wider if step < 2 else 1.0) * gate
-        num_near = near_loop(features, room[0, :num_free], plane, limit, room[1])
+        num_near = near_loop(places, packed, room[0, :num_free], plane, limit, room[1])
         part = room[2]
-        count, independent = connected_part_loop(features, room[1, :num_near], part[:count], rank, link, mark, part)
+        count, independent = connected_part_loop(
+            places, spacing, partner, carrier, neighbours, room[1, :num_near], part[:count], rank, link, mark, part
+        )
         if independent < min_support:
             return count, 0.0
         rows = part[:count]
-        heights_loop(features, rows, plane, height, spread)
+        heights_loop(places, packed, rows, plane, height, spread)
         for k in range(count):
             # Weights that fall with the distance lead to where the layer is densest, not to the middle of what it
             # cuts off.
             weight[k] = 1.0 / (1.0 + (height[k] / spread[k]) ** 2) ** 2
         copy(plane, before)
-        fit_loop(features[0], features[1], rows, weight, rounds, plane, center, precision)
+        fit_loop(places, packed, rows, weight, rounds, plane, center, precision)
         turned = before[0] * plane[0] + before[1] * plane[1] + before[2] * plane[2]
-        heights_loop(features, rows, plane, moved, spread)
+        heights_loop(places, packed, rows, plane, moved, spread)
         largest, usual = 0.0, median(spread[:count])
         for k in range(count):
             largest = max(largest, abs(moved[k] - math.copysign(height[k], turned * height[k])))
         if step > 1 and largest < converged * usual:
             break
-    tilt = tilt_loop(features[0], room[2, :count], plane, center, precision)
+    tilt = tilt_loop(places, room[2, :count], plane, center, precision)
     return count, band * median(spread[:count]) if tilt <= max_tilt**2 else 0.0
 
 
 @loop
-def _polished_loop(features, rows, band, gates, mark, layer, joined, numbers, plane):
+def _polished_loop(features, rows, band, gates, mark, layer, joined, numbers, plane, center):
     """Fit a plane to what lies on it in the layer around it, where it is connected; return how much, and its share.
 
     Judged against all that is near, taken or not: what lies on a plane beside this one speaks against it. Membership is
     the weight: all of the plane where it is clean, its densest part where it is not.
     """
-    places, packed, spacing = features[0], features[1], features[2]
+    places, packed, spacing, balls = features[0], features[1], features[2], features[6]
     link, inlier, least_share, turns, steps, rounds = gates
-    height, spread, density, weight, center = numbers[0], numbers[1], numbers[2], numbers[3], np.empty(3)
+    height, spread, density, weight = numbers[0], numbers[1], numbers[2], numbers[3]
     count, share = 0, 0.5
     for _ in range(steps):
-        number = layer_loop(features, plane, band, layer)
+        number = layer_loop(places, balls, plane, band, layer)
         connected_loop(places, rows, places, layer[:number], spacing, link, plane, joined)
         for k in range(len(rows)):
             mark[rows[k]] = k
@@ -123,7 +127,7 @@ def _polished_loop(features, rows, band, gates, mark, layer, joined, numbers, pl
                 count += 1
         for k in range(len(rows)):
             mark[rows[k]] = -1
-        heights_loop(features, layer[:count], plane, height, spread)
+        heights_loop(places, packed, layer[:count], plane, height, spread)
         for k in range(count):
             s = max(spread[k], 1e-12 * band)
             density[k] = math.sqrt(2.0 / math.pi) / s * math.exp(-0.5 * min((height[k] / s) ** 2, MAX_SQUARE))
@@ -146,13 +150,13 @@ def _polished_loop(features, rows, band, gates, mark, layer, joined, numbers, pl
 
 
 @loop
-def _grow_loop(features, labels, gates, others, mark, room, joined, numbers, plane):
+def _grow_loop(features, labels, gates, others, mark, room, joined, numbers, plane, center):
     """Refine and polish a plane; return its number of features, half thickness, and what its layer holds and shares."""
     count, band = _refined_loop(features, labels, gates, mark, room, numbers, plane)
     inner, share = 0, 0.0
     if band > 0.0:
         inner, share = _polished_loop(
-            features, room[2, :count], band, others, mark, room[3], joined, numbers, plane
+            features, room[2, :count], band, others, mark, room[3], joined, numbers, plane, center
         )  # fmt: skip
     return count, band, inner, share
 
@@ -203,12 +207,12 @@ class Grower:
 
         It grows from the neighbourhood of its ``home``, a feature: what lies on the same plane far away is another's.
         """
-        features, options, plane = self._features, self._options, plane.copy()
+        features, options, plane, center = self._features, self._options, plane.copy(), np.empty(3)
         first = features.neighbours[home]
         self._room[2, : len(first)] = first
         count, band, inner, share = _grow_loop(
             features.arrays, labels, self._refining, self._polishing, self._mark, self._room, self._joined,
-            self._numbers, plane,
+            self._numbers, plane, center,
         )  # fmt: skip
         rows, layer = self._room[2, :count].copy(), self._room[3, :inner]
         if inner == 0 or share < options.min_share:
@@ -216,17 +220,29 @@ class Grower:
         alarm = self._log10_false_alarms(plane, rows)
         if alarm > np.log10(options.max_false_alarms):
             return None, plane, rows
-        fit = fit_plane(features.places[layer], features.covariances[layer], self._numbers[3, :inner])
+        precision, weight = self._numbers[2, :inner], self._numbers[3, :inner]
+        fit = fit_with_covariance(plane, center, features.places[layer], precision, weight)
         # The whole layer is taken out: relief so near to a plane cannot be told from it.
         taken = np.union1d(rows, layer[labels[layer] < 0])
         return Grown(fit, share, band, alarm, features.places[rows], taken), plane, rows
 
     def _log10_false_alarms(self, plane: FloatArray, rows: IntArray) -> float:
         """Number of planes tried on which as much would lie by chance, of their neighbourhood, base-10 logarithm."""
-        places = self._features.places[rows]
-        center = places.mean(axis=0)
-        radius = float(np.quantile(norm(places - center), GATES.extent))
-        inside, chance = ball_loop(self._features.arrays, rows, center, radius, plane, self._gate, self._mark)
+        features, places = self._features, self._features.places
+        center = places[rows].mean(axis=0)
+        radius = float(np.quantile(norm(places[rows] - center), GATES.extent))
+        inside, chance = ball_loop(
+            places,
+            features.packed,
+            features.carrier,
+            features.balls,
+            rows,
+            center,
+            radius,
+            plane,
+            self._gate,
+            self._mark,
+        )
         if inside == 0:
             return self._log_tried
         return log10_poisson_tail(inside - 4, chance) + self._log_tried  # three fix it
@@ -238,7 +254,7 @@ def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, pl
     Parameters
     ----------
     places : (M, 3) float64
-        Support of the plane, near points together.
+        Support of the plane.
     tested : (N, 3) float64
         Points to test.
     spacing : (N,) float64
@@ -250,7 +266,9 @@ def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, pl
     -------
     (N,) bool
     """
-    connected = np.empty(len(tested), bool)
-    every, each = np.arange(len(places)), np.arange(len(tested))
-    connected_loop(places, every, tested, each, spacing, GATES.link, plane, connected)
-    return connected
+    if len(tested) == 0:
+        return np.zeros(0, dtype=bool)
+    basis = np.stack(perpendicular(plane[:3]), axis=1)
+    tree = kd_tree(places @ basis, balanced_tree=False, compact_nodes=False)
+    distance, _ = tree.query(tested @ basis, distance_upper_bound=np.nextafter(GATES.link * spacing.max(), np.inf))
+    return np.asarray(distance <= GATES.link * spacing)

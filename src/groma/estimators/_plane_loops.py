@@ -129,9 +129,9 @@ def fit_loop(places, packed, rows, weight, iterations, plane, center, precision)
 
 
 @loop
-def near_loop(features, rows, plane, limit, out):
+def near_loop(places, packed, rows, plane, limit, out):
     """Write the rows whose squared distance from a plane is below ``limit`` variances; return how many."""
-    count, places, packed = 0, features[0], features[1]
+    count = 0
     for k in range(len(rows)):
         if lies_on_kernel(rows[k], places, packed, plane, limit):
             out[count] = rows[k]
@@ -140,9 +140,8 @@ def near_loop(features, rows, plane, limit, out):
 
 
 @loop
-def near_free_loop(features, labels, plane, limit, out):
+def near_free_loop(places, packed, balls, labels, plane, limit, out):
     """As :func:`near_loop`, of all points without a label."""
-    places, packed, balls = features[0], features[1], features[6]
     count = 0
     for b in range(len(balls)):
         height = abs(height_kernel(balls[b], plane)) - balls[b, 3]
@@ -156,9 +155,8 @@ def near_free_loop(features, labels, plane, limit, out):
 
 
 @loop
-def layer_loop(features, plane, band, out):
+def layer_loop(places, balls, plane, band, out):
     """Write the points nearer to a plane than ``band``; return how many."""
-    places, balls = features[0], features[6]
     count = 0
     for b in range(len(balls)):
         if abs(height_kernel(balls[b], plane)) - balls[b, 3] >= band:
@@ -271,13 +269,12 @@ def _join_kernel(parent, k, j):
 
 
 @loop
-def linked_loop(features, rows, rank, reach, mark, parent):
+def linked_loop(places, spacing, partner, neighbours, rows, rank, reach, mark, parent):
     """Link rows to their nearest: ``parent`` (M,) gets the first row of the part that each is in.
 
     Two are linked if one is among the nearest ``rank`` of the other and not farther than ``reach`` times the larger of
     their spacings, and if they are the two ends of a segment. ``mark`` holds the position of each row.
     """
-    places, _, spacing, partner, _, neighbours, _ = features
     number, width, widest = len(rows), min(rank + 1, len(rows)), 0.0
     nearest, squared = np.empty(width, np.int64), np.empty(width)
     points, boxes = np.empty((number, 3)), np.empty((0, 6))
@@ -310,12 +307,12 @@ def linked_loop(features, rows, rank, reach, mark, parent):
 
 
 @loop
-def connected_part_loop(features, rows, held, rank, reach, mark, out):
+def connected_part_loop(places, spacing, partner, carrier, neighbours, rows, held, rank, reach, mark, out):
     """Write the connected part of rows with most of what is ``held`` (K,); its size, and without what segments carry.
 
     See :func:`linked_loop`. Fewer than three rows are one part with nothing in it.
     """
-    carrier, number = features[4], len(rows)
+    number = len(rows)
     if number < 3:
         for k in range(number):
             out[k] = rows[k]
@@ -323,7 +320,7 @@ def connected_part_loop(features, rows, held, rank, reach, mark, out):
     parent, size = np.empty(number, np.int64), np.zeros(number, np.int64)
     for k in range(number):
         mark[rows[k]] = k
-    linked_loop(features, rows, rank, reach, mark, parent)
+    linked_loop(places, spacing, partner, neighbours, rows, rank, reach, mark, parent)
     for k in range(len(held)):
         if mark[held[k]] >= 0:
             size[parent[mark[held[k]]]] += 1
@@ -349,9 +346,8 @@ def connected_part_loop(features, rows, held, rank, reach, mark, out):
 
 
 @loop
-def ball_loop(features, rows, center, radius, plane, gate, mark):
+def ball_loop(places, packed, carrier, balls, rows, center, radius, plane, gate, mark):
     """Support in a ball, and how much would be in the layer by chance; carried points do not count."""
-    places, packed, _, _, carrier, _, balls = features
     squared = radius * radius
     for k in range(len(rows)):
         i = rows[k]
