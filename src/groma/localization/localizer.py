@@ -39,6 +39,7 @@ from groma.localization.repeated import Described, alike_limits
 from groma.localization.retrieval import VladRetrieval
 from groma.mapping.photographs import check_cameras, read_gray
 from groma.scene import Scene
+from groma.solver.linear.blas import one_blas_thread
 
 
 @dataclass(frozen=True)
@@ -176,12 +177,13 @@ class Localizer:
 
     def _localize(self, gray: GrayImage, camera: QueryCamera, options: PoseOptions) -> LocalizedImage:
         start = time.perf_counter()
-        query = find_features(gray, camera, self.options.lines, self.options.min_segment_length)
-        described = time.perf_counter()
-        images = self._alike(query.points)
-        pose, last = self._coarsely(query, camera, options, images)
-        if pose.status != "localized" or pose.votes < self.options.gates.plain:
-            pose, last = self._fully(query, camera, options, images)
+        with one_blas_thread():
+            query = find_features(gray, camera, self.options.lines, self.options.min_segment_length)
+            described = time.perf_counter()
+            images = self._alike(query.points)
+            pose, last = self._coarsely(query, camera, options, images)
+            if pose.status != "localized" or pose.votes < self.options.gates.plain:
+                pose, last = self._fully(query, camera, options, images)
         done = time.perf_counter()
         return LocalizedImage(pose, last.points[:, 1], last.lines[:, 1], described - start, done - described)
 
