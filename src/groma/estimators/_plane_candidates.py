@@ -10,19 +10,23 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
-from groma._numba import kernel, loop
+from groma._numba import loop
+from groma._ordering import median
 from groma._trees import kd_tree
-from groma._typing import FloatArray, IntArray
-from groma.estimators._plane_loops import BALL, height_kernel, least_axis_kernel, variance_kernel
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.estimators._plane_loops import BALL, height_kernel, least_axis_kernel, lies_on_kernel, variance_kernel
 from groma.estimators._plane_options import PLANE_SEARCH
 from groma.execution import map_in_threads, num_threads
 from groma.geometry.algebra import dot, norm
 
 #: Pairs looked at together (cost: memory).
 _CHUNK = 4096
+#: Features, or up to twice as many, that tell whether two planes are the same (cost: time only).
+_JUDGES = 64
 #: Candidates that are worth a thread: one takes a hundredth of a millisecond, and handing over a tenth. And pieces for
 #: each thread, as some candidates take longer than others (cost: time only).
 _SCORED_AT_ONCE, _PIECES = 256, 8
@@ -30,47 +34,58 @@ _SCORED_AT_ONCE, _PIECES = 256, 8
 
 @dataclass(frozen=True)
 class Features:
-    """Points and segment ends."""
+    """Points and segment ends, near ones together."""
 
     places: FloatArray
     covariances: FloatArray
+    #: (N, 6) covariances as vectors whose product with :func:`squares` of a normal is the variance along it.
+    packed: FloatArray
+    #: (N,) distance at which a feature has its neighbours.
+    spacing: FloatArray
     #: (N,) other end of the same segment, or the feature itself.
     partner: IntArray
     #: (N,) first end of the segment that a point lies on, -1 for none.
     carrier: IntArray
-    #: (N,) distance at which a feature has its neighbours.
-    spacing: FloatArray
-    #: (N, 6) covariances as vectors whose product with :func:`squares` of a normal is the variance along it.
-    packed: FloatArray
     #: (N, n) the nearest features of each, itself first.
     neighbours: IntArray
-    #: (N,) all features, those near each other together, and the balls (B, 5) that hold ``BALL`` of them each: center,
-    #: radius, a bound of the variances.
-    order: IntArray
+    #: (B, 5) balls that hold ``BALL`` features each: center, radius, a bound of the variances.
     balls: FloatArray
+    #: (N,) the number that each was given with, and where each of those is here.
+    given: IntArray
+    position: IntArray
 
-    def spread(self, normal: FloatArray, rows: IntArray | slice = slice(None)) -> FloatArray:
-        """Standard deviations along a normal."""
-        return np.sqrt(np.maximum(self.packed[rows] @ squares(normal), 1e-300))
+    @property
+    def arrays(self) -> tuple[Any, ...]:
+        """What loops take."""
+        return self.places, self.packed, self.spacing, self.partner, self.carrier, self.neighbours, self.balls
 
 
 def features_of(places: FloatArray, noise: FloatArray, partner: IntArray, carrier: IntArray) -> Features:
     """Return places (N, 3) of points and segment ends with their covariances (N, 3, 3), and what is near what."""
     near = min(PLANE_SEARCH.neighbours, len(places))
     tree = kd_tree(places)
+    given = np.asarray(tree.indices, dtype=np.int64)
+    position = np.empty_like(given)
+    position[given] = np.arange(len(given))
+    places, noise = places[given], noise[given]
     distance, neighbours = tree.query(places, k=near, workers=num_threads())
-    spacing = np.maximum(distance[:, min(PLANE_SEARCH.rank, near - 1)], 1e-12)
-    order = np.asarray(tree.indices, dtype=np.int64)
-    first = np.arange(0, len(order), BALL)
-    number = np.diff(np.append(first, len(order)))
-    center = np.add.reduceat(places[order], first) / number[:, None]
-    radius = np.maximum.reduceat(norm(places[order] - np.repeat(center, number, axis=0)), first)
-    variance = np.maximum.reduceat(np.trace(noise, axis1=1, axis2=2)[order], first)
-    balls = np.column_stack([center, radius, variance])
-    packed = np.ascontiguousarray(noise[:, *np.triu_indices(3)])
+    first = np.arange(0, len(places), BALL)
+    number = np.diff(np.append(first, len(places)))
+    center = np.add.reduceat(places, first) / number[:, None]
+    radius = np.maximum.reduceat(norm(places - np.repeat(center, number, axis=0)), first)
+    variance = np.maximum.reduceat(np.trace(noise, axis1=1, axis2=2), first)
     return Features(
-        places, noise, partner, carrier, spacing, packed, np.asarray(neighbours, dtype=np.int32), order, balls
-    )  # fmt: skip
+        places=places,
+        covariances=noise,
+        packed=np.ascontiguousarray(noise[:, *np.triu_indices(3)]),
+        spacing=np.maximum(distance[:, min(PLANE_SEARCH.rank, near - 1)], 1e-12),
+        partner=position[partner[given]],
+        carrier=np.where(carrier >= 0, position[carrier], -1)[given],
+        neighbours=position.astype(np.int32)[neighbours],
+        balls=np.column_stack([center, radius, variance]),
+        given=given,
+        position=position,
+    )
 
 
 def squares(normal: FloatArray) -> FloatArray:
@@ -135,7 +150,7 @@ def from_neighbours(features: Features, gate: float, rng: np.random.Generator) -
     """Candidates (H, 4) from a feature and two of its neighbours, improved on the neighbourhood; their homes (H,)."""
     number, near = features.neighbours.shape
     count = max(number // PLANE_SEARCH.features_per_seed, min(PLANE_SEARCH.min_seeds, PLANE_SEARCH.repeated * number))
-    seed = rng.permutation(np.repeat(np.arange(number), -(-count // number)))[:count]
+    seed = features.position[rng.permutation(np.repeat(np.arange(number), -(-count // number)))[:count]]
     choice = rng.integers(1, near, (count, 2))
     planes = np.empty((count, 4))
     _through_neighbours(
@@ -151,7 +166,8 @@ def from_segments(features: Features, num_points: int, gate: float) -> tuple[Flo
 
     Of the pairs of a segment, those that fix their plane best.
     """
-    ends = features.places[num_points:].reshape(-1, 2, 3)
+    corner = features.position[num_points:].reshape(-1, 2)
+    ends = features.places[corner]
     if len(ends) < 2:
         return np.zeros((0, 4)), np.zeros(0, np.int64), 0
     middle = ends.mean(axis=1)
@@ -161,19 +177,19 @@ def from_segments(features: Features, num_points: int, gate: float) -> tuple[Flo
     once = np.unique(np.column_stack([np.minimum(first, second), np.maximum(first, second)]), axis=0)
     once = once[once[:, 0] != once[:, 1]]
     chunks = [once[k : k + _CHUNK] for k in range(0, len(once), _CHUNK)]
-    parts = map_in_threads(partial(_coplanar, features, num_points, gate), chunks)
+    parts = map_in_threads(partial(_coplanar, features, corner, gate), chunks)
     pairs, planes, worth = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.lexsort((-worth, pairs[:, 0]))
     owner = pairs[order, 0]
     chosen = np.sort(order[np.arange(len(order)) - np.searchsorted(owner, owner) < PLANE_SEARCH.pairs])
-    return planes[chosen], num_points + 2 * pairs[chosen, 0], len(once)
+    return planes[chosen], corner[pairs[chosen, 0], 0], len(once)
 
 
 def _coplanar(
-    features: Features, num_points: int, gate: float, pairs: IntArray
+    features: Features, ends: IntArray, gate: float, pairs: IntArray
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Those of some pairs (M, 2) of segments that span a plane, the planes (M, 4), and how well each is fixed (M,)."""
-    corner = (num_points + 2 * pairs[:, [0, 0, 1, 1]]) + np.array([0, 1, 0, 1])
+    corner = ends[pairs].reshape(-1, 4)
     four = features.places[corner]
     center = four.mean(axis=1)
     away = four - center[:, None]
@@ -187,24 +203,15 @@ def _coplanar(
     return pairs[flat], planes[flat], values[flat, 1] / variance[flat]
 
 
-@kernel
-def _lies_on(i, places, packed, labels, plane, gate):
-    height = height_kernel(places[i], plane)
-    variance = max(variance_kernel(packed[i], plane[0], plane[1], plane[2]), 1e-300)
-    return labels[i] < 0 and height * height < gate * variance
-
-
 @loop
-def scores_loop(
-    places, packed, spacing, partner, neighbours, labels, gate, reach, planes, homes, which, stamp, number, queue,
-    support, score,
-):  # fmt: skip
+def scores_loop(features, labels, gate, reach, planes, homes, which, stamp, number, queue, support, score):
     """For some candidates, how many free features lie on them around their homes (M,), and their information (M,).
 
     What lies on the plane is followed from neighbour to neighbour, until ``queue`` is full. Each feature adds the
     logarithm of the extent of all that was found over its own noise, less near the gate. ``stamp`` (N,) holds numbers
     up to ``number``; higher ones are written.
     """
+    places, packed, spacing, partner, _, neighbours, _ = features
     for w in range(len(which)):
         number += 1
         plane, home = planes[which[w]], homes[which[w]]
@@ -212,7 +219,7 @@ def scores_loop(
         for m in range(neighbours.shape[1]):
             i = neighbours[home, m]
             stamp[i] = number
-            if count < len(queue) and _lies_on(i, places, packed, labels, plane, gate):
+            if count < len(queue) and labels[i] < 0 and lies_on_kernel(i, places, packed, plane, gate):
                 queue[count] = i
                 count += 1
         while begin < count < len(queue):
@@ -227,7 +234,7 @@ def scores_loop(
                     if x * x + y * y + z * z > (reach * max(spacing[i], spacing[j])) ** 2:
                         continue
                 stamp[j] = number
-                if count < len(queue) and _lies_on(j, places, packed, labels, plane, gate):
+                if count < len(queue) and labels[j] < 0 and lies_on_kernel(j, places, packed, plane, gate):
                     queue[count] = j
                     count += 1
         support[w], score[w] = count, 0.0
@@ -251,6 +258,35 @@ def scores_loop(
                 score[w] += (1.0 - height * height / variance) * 0.5 * math.log(spread / variance)
 
 
+@loop
+def keep_others_loop(features, rows, plane, planes, same, first_at, at, mark, alive):
+    """Take candidates near rows that would end at their plane off those that are ``alive`` (H,).
+
+    Those are where half of some rows, or more, are within so many standard deviations. Candidates ``at[first_at[i]]``
+    to before ``at[first_at[i + 1]]`` are at home at feature i. ``mark`` (N,) holds -1, and does so again.
+    """
+    places, packed, neighbours = features[0], features[1], features[5]
+    spread = np.empty(len(rows))
+    for k in range(len(rows)):
+        spread[k] = math.sqrt(max(variance_kernel(packed[rows[k]], plane[0], plane[1], plane[2]), 1e-300))
+    limit, step = same * median(spread), max(1, len(rows) // _JUDGES)
+    height = np.empty((len(rows) + step - 1) // step)
+    for k in range(len(rows)):
+        for m in range(neighbours.shape[1]):
+            i = neighbours[rows[k], m]
+            if mark[i] >= 0:
+                continue
+            mark[i] = 0
+            for c in range(first_at[i], first_at[i + 1]):
+                if alive[at[c]]:
+                    for j in range(len(height)):
+                        height[j] = abs(height_kernel(places[rows[j * step]], planes[at[c]]))
+                    alive[at[c]] = median(height) > limit
+    for k in range(len(rows)):
+        for m in range(neighbours.shape[1]):
+            mark[neighbours[rows[k], m]] = -1
+
+
 class Scores:
     """Scores of candidates where they are at home.
 
@@ -272,6 +308,9 @@ class Scores:
         self._features, self._planes, self._homes = features, planes, homes
         self._gate, self._reach = gate, reach
         self._rooms: list[_Room] = []
+        self._at = np.argsort(homes, kind="stable")
+        self._first_at = np.searchsorted(homes[self._at], np.arange(len(features.places) + 1))
+        self._mark = np.full(len(features.places), -1)
 
     def of(self, which: IntArray, labels: IntArray) -> tuple[IntArray, FloatArray]:
         """Support (M,) and score (M,) of some candidates among the features without a label."""
@@ -287,15 +326,22 @@ class Scores:
             except IndexError:
                 room = _Room(len(features.places))
             scores_loop(
-                features.places, features.packed, features.spacing, features.partner, features.neighbours, labels,
-                self._gate, self._reach, self._planes, self._homes, which[part], room.stamp, room.number, room.queue,
-                support[part], score[part],
+                features.arrays, labels, self._gate, self._reach, self._planes, self._homes, which[part], room.stamp,
+                room.number, room.queue, support[part], score[part],
             )  # fmt: skip
             room.number += part.stop - part.start
             self._rooms.append(room)
 
         map_in_threads(fill, range(pieces))
         return support, score
+
+    def keep_others(self, plane: FloatArray, rows: IntArray, alive: BoolArray) -> None:
+        """Take candidates that would end at a plane, on some features, off those that are worth a try (H,)."""
+        if len(rows):
+            keep_others_loop(
+                self._features.arrays, rows, plane, self._planes, PLANE_SEARCH.same, self._first_at, self._at,
+                self._mark, alive,
+            )  # fmt: skip
 
 
 class _Room:

@@ -3,28 +3,162 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from groma._numba import loop
+from groma._ordering import copy, median
 from groma._trees import kd_tree
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators._plane_candidates import Features
 from groma.estimators._plane_loops import (
     ball_loop,
+    connected_loop,
     connected_part_loop,
     fit_loop,
-    heights_loop,
+    height_kernel,
     layer_loop,
     near_free_loop,
     near_loop,
-    nearest_rows_loop,
+    variance_kernel,
 )
 from groma.estimators._plane_options import PLANE_SEARCH as GATES
 from groma.estimators._plane_options import PlaneOptions
-from groma.estimators.association import inlier_probability, log10_poisson_tail
-from groma.estimators.plane_fit import PlaneFit, fit_plane, tilt_sigma
+from groma.estimators.association import MAX_SQUARE, ROUNDS, log10_poisson_tail
+from groma.estimators.plane_fit import PlaneFit, fit_with_covariance
 from groma.geometry.algebra import norm, perpendicular
+
+
+@loop
+def heights_loop(places, packed, rows, plane, height, spread):
+    """Signed distances (M,) of rows from a plane, and their standard deviations (M,)."""
+    for k in range(len(rows)):
+        i = rows[k]
+        height[k] = height_kernel(places[i], plane)
+        spread[k] = math.sqrt(max(variance_kernel(packed[i], plane[0], plane[1], plane[2]), 1e-300))
+
+
+@loop
+def tilt_loop(places, rows, plane, center, precision):
+    """Largest variance of the normal of a plane fitted to rows (M,) with some precisions (M,), square radians."""
+    s00 = s01 = s02 = s11 = s12 = s22 = 0.0
+    for k in range(len(rows)):
+        i, p = rows[k], precision[k]
+        x, y, z = places[i, 0] - center[0], places[i, 1] - center[1], places[i, 2] - center[2]
+        s00, s01, s02 = s00 + p * x * x, s01 + p * x * y, s02 + p * x * z
+        s11, s12, s22 = s11 + p * y * y, s12 + p * y * z, s22 + p * z * z
+    # Of the three eigenvalues that of the normal is left out: the sum and the product of the other two.
+    a, b, c = plane[0], plane[1], plane[2]
+    total = s00 + s11 + s22 - variance_kernel((s00, s01, s02, s11, s12, s22), a, b, c)
+    minors = s11 * s22 - s12 * s12, s02 * s12 - s01 * s22, s01 * s12 - s02 * s11
+    others = s00 * s22 - s02 * s02, s01 * s02 - s00 * s12, s00 * s11 - s01 * s01
+    product = variance_kernel(minors + others, a, b, c)
+    if not product > 0.0:
+        return np.inf
+    return (0.5 * total + math.sqrt(max(0.25 * total * total - product, 0.0))) / product
+
+
+@loop
+def _refined_loop(features, labels, gates, mark, room, numbers, plane):
+    """Refine a plane on the part of what lies on it that is connected; ``room[2]`` begins with the first such part.
+
+    Returns how many features that part has in the end, and the half thickness of the layer: 0 if it is no plane.
+    """
+    places, packed, spacing, partner, carrier, neighbours, balls = features
+    gate, wider, far, link, converged, band, min_support, max_tilt, rank, steps, rounds = gates
+    height, spread, moved, weight, precision = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
+    before, center = np.empty(4), np.empty(3)
+    num_free = num_near = 0
+    count = neighbours.shape[1]
+    for step in range(steps):
+        # What is far away stays away. The first rounds reach farther: the candidate is not yet exact.
+        if step < 2:
+            reach = (far if step == 1 else wider) * gate
+            num_free = near_free_loop(places, packed, balls, labels, plane, reach, room[0])
+        limit = (wider if step < 2 else 1.0) * gate
+        num_near = near_loop(places, packed, room[0, :num_free], plane, limit, room[1])
+        part = room[2]
+        count, independent = connected_part_loop(
+            places, spacing, partner, carrier, neighbours, room[1, :num_near], part[:count], rank, link, mark, part
+        )
+        if independent < min_support:
+            return count, 0.0
+        rows = part[:count]
+        heights_loop(places, packed, rows, plane, height, spread)
+        for k in range(count):
+            # Weights that fall with the distance lead to where the layer is densest, not to the middle of what it
+            # cuts off.
+            weight[k] = 1.0 / (1.0 + (height[k] / spread[k]) ** 2) ** 2
+        copy(plane, before)
+        fit_loop(places, packed, rows, weight, rounds, plane, center, precision)
+        turned = before[0] * plane[0] + before[1] * plane[1] + before[2] * plane[2]
+        heights_loop(places, packed, rows, plane, moved, spread)
+        largest, usual = 0.0, median(spread[:count])
+        for k in range(count):
+            largest = max(largest, abs(moved[k] - math.copysign(height[k], turned * height[k])))
+        if step > 1 and largest < converged * usual:
+            break
+    tilt = tilt_loop(places, room[2, :count], plane, center, precision)
+    return count, band * median(spread[:count]) if tilt <= max_tilt**2 else 0.0
+
+
+@loop
+def _polished_loop(features, rows, band, gates, mark, layer, joined, numbers, plane, center):
+    """Fit a plane to what lies on it in the layer around it, where it is connected; return how much, and its share.
+
+    Judged against all that is near, taken or not: what lies on a plane beside this one speaks against it. Membership is
+    the weight: all of the plane where it is clean, its densest part where it is not.
+    """
+    places, packed, spacing, balls = features[0], features[1], features[2], features[6]
+    link, inlier, least_share, turns, steps, rounds = gates
+    height, spread, density, weight = numbers[0], numbers[1], numbers[2], numbers[3]
+    count, share = 0, 0.5
+    for _ in range(steps):
+        number = layer_loop(places, balls, plane, band, layer)
+        connected_loop(places, rows, places, layer[:number], spacing, link, plane, joined)
+        for k in range(len(rows)):
+            mark[rows[k]] = k
+        count = 0
+        for k in range(number):
+            if joined[k] or mark[layer[k]] >= 0:
+                layer[count] = layer[k]
+                count += 1
+        for k in range(len(rows)):
+            mark[rows[k]] = -1
+        heights_loop(places, packed, layer[:count], plane, height, spread)
+        for k in range(count):
+            s = max(spread[k], 1e-12 * band)
+            density[k] = math.sqrt(2.0 / math.pi) / s * math.exp(-0.5 * min((height[k] / s) ** 2, MAX_SQUARE))
+        share = 0.5
+        for _ in range(turns):  # as in groma.estimators.association, of one structure
+            total = 0.0
+            for k in range(count):
+                weight[k] = share * density[k] / (share * density[k] + (1.0 - share) / band)
+                total += weight[k]
+            share = (total + 1.0) / (count + 2.0)
+        positive = 0
+        for k in range(count):
+            if not abs(height[k]) < inlier * spread[k]:
+                weight[k] = 0.0
+            positive += weight[k] > 0.0
+        if share < least_share or positive < 3:
+            return 0, 0.0
+        fit_loop(places, packed, layer[:count], weight, rounds, plane, center, density)
+    return count, share
+
+
+@loop
+def _grow_loop(features, labels, gates, others, mark, room, joined, numbers, plane, center):
+    """Refine and polish a plane; return its number of features, half thickness, and what its layer holds and shares."""
+    count, band = _refined_loop(features, labels, gates, mark, room, numbers, plane)
+    inner, share = 0, 0.0
+    if band > 0.0:
+        inner, share = _polished_loop(
+            features, room[2, :count], band, others, mark, room[3], joined, numbers, plane, center
+        )  # fmt: skip
+    return count, band, inner, share
 
 
 @dataclass(frozen=True)
@@ -35,8 +169,8 @@ class Grown:
     share: float
     band: float
     log10_false_alarms: float
-    #: The features on it, and those taken out with it.
-    rows: IntArray
+    #: (M, 3) where the features on it are, and all features that are taken out with it.
+    places: FloatArray
     taken: IntArray
 
 
@@ -59,133 +193,59 @@ class Grower:
         self._features = features
         self._gate, self._log_tried, self._options = gate, log_tried, options
         count = len(features.places)
-        self._mark, self._held = np.full(count, -1), np.zeros(count, np.int64)
-        self._room, self._layer = np.empty(count, np.int64), np.empty(count, np.int64)
+        self._mark, self._room = np.full(count, -1), np.empty((4, count), np.int64)
+        self._joined, self._numbers = np.empty(count, bool), np.empty((5, count))
+        self._refining = (
+            gate, GATES.wider, GATES.far, GATES.link, GATES.converged, GATES.band, options.min_support,
+            options.max_tilt, GATES.rank, GATES.grow_steps, GATES.fit_rounds,
+        )  # fmt: skip
+        least = GATES.hopeless * options.min_share
+        self._polishing = GATES.link, GATES.inlier, least, ROUNDS, GATES.polish_steps, GATES.fit_rounds
 
     def grow(self, plane: FloatArray, home: int, labels: IntArray) -> tuple[Grown | None, FloatArray, IntArray]:
         """Refine a candidate where it is connected, and judge it: what is kept, where it went, its support.
 
         It grows from the neighbourhood of its ``home``, a feature: what lies on the same plane far away is another's.
         """
-        features, gate, options = self._features, self._gate, self._options
-        free = None
-        rows, weight = features.neighbours[home], np.zeros(0)
-        for step in range(GATES.grow_steps):
-            if step == 1:  # what is far away stays away
-                free = self._near_free(labels, plane, GATES.far * gate)
-            # The first rounds reach farther: the candidate is not yet exact.
-            limit = (GATES.wider if step < 2 else 1.0) * gate
-            near = self._near_free(labels, plane, limit) if free is None else self._near(free, plane, limit)
-            rows, independent = self._part(near, rows)
-            if independent < options.min_support:
-                return None, plane, rows
-            height, spread = self._heights(rows, plane)
-            # Weights that fall with the distance lead to where the layer is densest, not to the middle of what it
-            # cuts off.
-            weight = 1.0 / (1.0 + (height / spread) ** 2) ** 2
-            before, plane = plane, self._fitted(rows, weight)
-            turned = float(np.sign(before[:3] @ plane[:3]))
-            moved, spread = self._heights(rows, plane)
-            moved -= turned * height
-            if step > 1 and np.abs(moved).max() < GATES.converged * _median(spread):
-                break
-        if (
-            tilt_sigma(fit_plane(features.places[rows], features.covariances[rows], weight).covariance)
-            > options.max_tilt
-        ):
-            return None, plane, rows
-        band = GATES.band * _median(self._heights(rows, plane)[1])
-        support, layer, share = features.places[rows], rows, np.zeros(1)
-        for _ in range(GATES.polish_steps):
-            # Judged against all that is near, taken or not: what lies on a plane beside this one speaks against it.
-            layer = self._layer[
-                : layer_loop(features.places, features.order, features.balls, plane, band, self._layer)
-            ].copy()
-            joined = np.isin(layer, rows, assume_unique=True, kind="table")
-            others = layer[~joined]
-            joined[~joined] = connected_to(support, features.places[others], features.spacing[others], plane)
-            layer = layer[joined]
-            height, spread = self._heights(layer, plane)
-            height = np.abs(height)
-            probability, share = inlier_probability(height, spread, np.zeros(len(layer), np.int64), np.array([band]))
-            weight = np.where(height < GATES.inlier * spread, probability, 0.0)
-            if share[0] < GATES.hopeless * options.min_share or np.count_nonzero(weight) < 3:
-                return None, plane, rows
-            # Membership as the weight: all of the plane where it is clean, its densest part where it is not.
-            plane = self._fitted(layer, weight)
-        if share[0] < options.min_share:
+        features, options, plane, center = self._features, self._options, plane.copy(), np.empty(3)
+        first = features.neighbours[home]
+        self._room[2, : len(first)] = first
+        count, band, inner, share = _grow_loop(
+            features.arrays, labels, self._refining, self._polishing, self._mark, self._room, self._joined,
+            self._numbers, plane, center,
+        )  # fmt: skip
+        rows, layer = self._room[2, :count].copy(), self._room[3, :inner]
+        if inner == 0 or share < options.min_share:
             return None, plane, rows
         alarm = self._log10_false_alarms(plane, rows)
         if alarm > np.log10(options.max_false_alarms):
             return None, plane, rows
-        fit = fit_plane(features.places[layer], features.covariances[layer], weight)
+        precision, weight = self._numbers[2, :inner], self._numbers[3, :inner]
+        fit = fit_with_covariance(plane, center, features.places[layer], precision, weight)
         # The whole layer is taken out: relief so near to a plane cannot be told from it.
         taken = np.union1d(rows, layer[labels[layer] < 0])
-        return Grown(fit, float(share[0]), band, alarm, rows, taken), plane, rows
-
-    def _near_free(self, labels: IntArray, plane: FloatArray, limit: float) -> IntArray:
-        """Features without a label whose squared distance is within so many variances."""
-        features = self._features
-        count = near_free_loop(
-            features.places, features.packed, labels, features.order, features.balls, plane, limit, self._room
-        )  # fmt: skip
-        return self._room[:count].copy()
-
-    def _near(self, rows: IntArray, plane: FloatArray, limit: float) -> IntArray:
-        """Those of some features whose squared distance is within so many variances."""
-        features = self._features
-        return self._room[: near_loop(features.places, features.packed, rows, plane, limit, self._room)].copy()
-
-    def _heights(self, rows: IntArray, plane: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Signed distances of features from a plane, and their standard deviations."""
-        height, spread = np.empty(len(rows)), np.empty(len(rows))
-        heights_loop(self._features.places, self._features.packed, rows, plane, height, spread)
-        return height, spread
-
-    def _fitted(self, rows: IntArray, weight: FloatArray) -> FloatArray:
-        """Plane through some features."""
-        plane, center, precision = np.empty(4), np.empty(3), np.empty(len(rows))
-        fit_loop(
-            self._features.places, self._features.packed, rows, weight, GATES.fit_rounds, plane, center, precision
-        )  # fmt: skip
-        return plane
-
-    def _part(self, rows: IntArray, held: IntArray) -> tuple[IntArray, int]:
-        """Part of some features that is connected in space, with most of those held; how many no segment carries."""
-        features, count = self._features, min(GATES.rank + 1, len(rows))
-        if count < 3:
-            return rows, 0
-        nearest, distance = np.empty((len(rows), count), np.int64), np.empty((len(rows), count))
-        short = np.empty(len(rows), np.int64)
-        missing = nearest_rows_loop(
-            features.places, rows, features.neighbours, self._mark, nearest, distance, short
-        )  # fmt: skip
-        if missing:  # the others among their neighbours do not lie on the plane
-            places, short = features.places[rows], short[:missing]
-            tree = kd_tree(places, balanced_tree=False, compact_nodes=False)
-            distance[short], nearest[short] = tree.query(places[short], k=count)
-        out, count_of = np.empty(len(rows), np.int64), np.empty(2, np.int64)
-        self._held[held] = 1
-        connected_part_loop(
-            rows, nearest, distance, GATES.link, features.spacing, features.partner, features.carrier, self._held,
-            self._mark, out, count_of,
-        )  # fmt: skip
-        self._held[held] = 0
-        return out[: count_of[0]], int(count_of[1])
+        return Grown(fit, share, band, alarm, features.places[rows], taken), plane, rows
 
     def _log10_false_alarms(self, plane: FloatArray, rows: IntArray) -> float:
         """Number of planes tried on which as much would lie by chance, of their neighbourhood, base-10 logarithm."""
-        features = self._features
-        center = features.places[rows].mean(axis=0)
-        radius = float(np.quantile(norm(features.places[rows] - center), GATES.extent))
-        found = np.zeros(2)
-        ball_loop(
-            features.places, features.packed, features.carrier, features.order, features.balls, rows, center, radius,
-            plane, self._gate, self._mark, found,
-        )  # fmt: skip
-        if found[0] == 0:
+        features, places = self._features, self._features.places
+        center = places[rows].mean(axis=0)
+        radius = float(np.quantile(norm(places[rows] - center), GATES.extent))
+        inside, chance = ball_loop(
+            places,
+            features.packed,
+            features.carrier,
+            features.balls,
+            rows,
+            center,
+            radius,
+            plane,
+            self._gate,
+            self._mark,
+        )
+        if inside == 0:
             return self._log_tried
-        return log10_poisson_tail(found[0] - 4, found[1]) + self._log_tried  # three fix it
+        return log10_poisson_tail(inside - 4, chance) + self._log_tried  # three fix it
 
 
 def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, plane: FloatArray) -> BoolArray:
@@ -212,12 +272,3 @@ def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, pl
     tree = kd_tree(places @ basis, balanced_tree=False, compact_nodes=False)
     distance, _ = tree.query(tested @ basis, distance_upper_bound=np.nextafter(GATES.link * spacing.max(), np.inf))
     return np.asarray(distance <= GATES.link * spacing)
-
-
-def _median(values: FloatArray) -> float:
-    """Median of a few numbers, without what NumPy does for many axes."""
-    half = len(values) // 2
-    if len(values) % 2:
-        return float(np.partition(values, half)[half])
-    ordered = np.partition(values, (half - 1, half))
-    return 0.5 * float(ordered[half - 1] + ordered[half])

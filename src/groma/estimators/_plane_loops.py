@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Loops of the plane search over points with packed covariances: fit, selection by distance, connected parts.
 
-Covariances are packed as (xx, xy, xz, yy, yz, zz). ``rows`` are the points that take part, in arrays of all points.
-``mark`` arrays have an entry per point, -1 on entry and again on return. ``order`` lists all points, near ones
-together; each ``BALL`` of them share a row of ``balls``: center, radius, and a bound of the variances. Balls that a
-plane does not come near are passed over, so that the loops look at what is near it, not at the whole scene.
+Covariances are packed as (xx, xy, xz, yy, yz, zz). ``features`` is the tuple of arrays of
+:class:`groma.estimators._plane_candidates.Features`, in which near points are together; ``rows`` are the points that
+take part, in their order. ``mark`` arrays have an entry per point, -1 on entry and again on return. Each ``BALL``
+points share a row of ``balls``: center, radius, and a bound of the variances. Balls that a plane does not come near are
+passed over, so that the loops look at what is near it, not at the whole scene.
 """
 
 from __future__ import annotations
@@ -15,10 +16,12 @@ import numpy as np
 
 from groma._numba import kernel, loop
 
-#: Points in a ball (cost: time only).
-BALL = 64
+#: Points in a ball, and points in a box that is not divided (cost: time only).
+BALL, _BOX = 64, 8
 #: Sweeps of Jacobi rotations: convergence is quadratic, four are enough (cost: none are made after convergence).
 _SWEEPS = 12
+#: What is as far away as is allowed is looked at by distance, not passed over by its square (derived from rounding).
+_ROUNDING = 1.0 + 1e-12
 
 
 @kernel
@@ -30,6 +33,13 @@ def variance_kernel(c, n0, n1, n2):
 @kernel
 def height_kernel(p, plane):
     return p[0] * plane[0] + p[1] * plane[1] + p[2] * plane[2] + plane[3]
+
+
+@kernel
+def lies_on_kernel(i, places, packed, plane, gate):
+    """Whether the squared distance of a point from a plane is below so many variances."""
+    height = height_kernel(places[i], plane)
+    return height * height < gate * max(variance_kernel(packed[i], plane[0], plane[1], plane[2]), 1e-300)
 
 
 @kernel
@@ -122,45 +132,36 @@ def fit_loop(places, packed, rows, weight, iterations, plane, center, precision)
 def near_loop(places, packed, rows, plane, limit, out):
     """Write the rows whose squared distance from a plane is below ``limit`` variances; return how many."""
     count = 0
-    n0, n1, n2 = plane[0], plane[1], plane[2]
     for k in range(len(rows)):
-        i = rows[k]
-        height = height_kernel(places[i], plane)
-        if height * height < limit * max(variance_kernel(packed[i], n0, n1, n2), 1e-300):
-            out[count] = i
+        if lies_on_kernel(rows[k], places, packed, plane, limit):
+            out[count] = rows[k]
             count += 1
     return count
 
 
 @loop
-def near_free_loop(places, packed, labels, order, balls, plane, limit, out):
+def near_free_loop(places, packed, balls, labels, plane, limit, out):
     """As :func:`near_loop`, of all points without a label."""
     count = 0
-    n0, n1, n2 = plane[0], plane[1], plane[2]
     for b in range(len(balls)):
         height = abs(height_kernel(balls[b], plane)) - balls[b, 3]
         if height > 0.0 and height * height >= limit * balls[b, 4]:
             continue
-        for k in range(b * BALL, min((b + 1) * BALL, len(order))):
-            i = order[k]
-            if labels[i] >= 0:
-                continue
-            height = height_kernel(places[i], plane)
-            if height * height < limit * max(variance_kernel(packed[i], n0, n1, n2), 1e-300):
+        for i in range(b * BALL, min((b + 1) * BALL, len(places))):
+            if labels[i] < 0 and lies_on_kernel(i, places, packed, plane, limit):
                 out[count] = i
                 count += 1
     return count
 
 
 @loop
-def layer_loop(places, order, balls, plane, band, out):
+def layer_loop(places, balls, plane, band, out):
     """Write the points nearer to a plane than ``band``; return how many."""
     count = 0
     for b in range(len(balls)):
         if abs(height_kernel(balls[b], plane)) - balls[b, 3] >= band:
             continue
-        for k in range(b * BALL, min((b + 1) * BALL, len(order))):
-            i = order[k]
+        for i in range(b * BALL, min((b + 1) * BALL, len(places))):
             if abs(height_kernel(places[i], plane)) < band:
                 out[count] = i
                 count += 1
@@ -168,82 +169,166 @@ def layer_loop(places, order, balls, plane, band, out):
 
 
 @loop
-def heights_loop(places, packed, rows, plane, height, spread):
-    """Signed distances (M,) of rows from a plane, and their standard deviations (M,)."""
-    for k in range(len(rows)):
-        i = rows[k]
-        height[k] = height_kernel(places[i], plane)
-        spread[k] = math.sqrt(max(variance_kernel(packed[i], plane[0], plane[1], plane[2]), 1e-300))
+def boxes_loop(points):
+    """Boxes (2 P, 6), least and largest coordinates, of points (N, 3), near ones together: a binary tree.
+
+    Row 1 holds all, 2 k and 2 k + 1 the halves of k, the last P each a few points. Those that are empty are inverted.
+    """
+    leaves = 1
+    while leaves * _BOX < len(points):
+        leaves *= 2
+    boxes = np.empty((2 * leaves, 6))
+    for k in range(len(boxes)):
+        for c in range(3):
+            boxes[k, c], boxes[k, c + 3] = np.inf, -np.inf
+    for k in range(len(points)):
+        for c in range(3):
+            box = boxes[leaves + k // _BOX]
+            box[c], box[c + 3] = min(box[c], points[k, c]), max(box[c + 3], points[k, c])
+    for k in range(leaves - 1, 0, -1):
+        for c in range(3):
+            boxes[k, c] = min(boxes[2 * k, c], boxes[2 * k + 1, c])
+            boxes[k, c + 3] = max(boxes[2 * k, c + 3], boxes[2 * k + 1, c + 3])
+    return boxes
 
 
 @loop
-def nearest_rows_loop(places, rows, neighbours, mark, nearest, distance, short):
-    """Nearest rows of each row, itself first, as positions in ``rows`` (M, n), among its neighbours in space (N, m).
+def nearest_loop(points, boxes, place, home, bound, nearest, squared):
+    """Write the nearest points to a place whose squared distances are below a bound, as many as there is room for.
 
-    ``short`` gets the positions of rows that have fewer than n among them; return how many. Sets ``mark`` to positions.
+    Returns how many there are. It begins near the point ``home``, so that most boxes are farther than what is found.
     """
-    missing = 0
-    for k in range(len(rows)):
-        mark[rows[k]] = k
-    for k in range(len(rows)):
-        i = rows[k]
-        nearest[k, 0], distance[k, 0] = k, 0.0
-        count = 1
-        for m in range(neighbours.shape[1]):
-            other = neighbours[i, m]
-            if mark[other] < 0 or other == i:
+    count, width, level = 0, len(nearest), 0
+    x, y, z = place[0], place[1], place[2]
+    while len(boxes) >> (level + 2):
+        level += 1
+    node, first = 1, home // _BOX
+    while node > 0:
+        k = node ^ (first >> level)
+        box = boxes[k]
+        a, b, c = max(box[0] - x, x - box[3], 0.0), max(box[1] - y, y - box[4], 0.0), max(box[2] - z, z - box[5], 0.0)
+        if a * a + b * b + c * c < bound:
+            if level > 0:
+                node, level = 2 * node, level - 1
                 continue
-            x, y, z = places[other, 0] - places[i, 0], places[other, 1] - places[i, 1], places[other, 2] - places[i, 2]
-            nearest[k, count], distance[k, count] = mark[other], math.sqrt(x * x + y * y + z * z)
-            count += 1
-            if count == nearest.shape[1]:
-                break
-        if count < nearest.shape[1]:
-            short[missing] = k
-            missing += 1
-    return missing
+            begin = _BOX * (k - len(boxes) // 2)
+            for i in range(begin, min(begin + _BOX, len(points))):
+                a, b, c = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
+                far = a * a + b * b + c * c
+                if far < bound:
+                    m = min(count, width - 1)
+                    while m > 0 and squared[m - 1] > far:
+                        nearest[m], squared[m] = nearest[m - 1], squared[m - 1]
+                        m -= 1
+                    nearest[m], squared[m] = i, far
+                    count = min(count + 1, width)
+                    if count == width:
+                        bound = squared[width - 1]
+        while node & 1:
+            node, level = node >> 1, level + 1
+        if node > 0:
+            node += 1
+    return count
 
 
 @loop
-def connected_part_loop(rows, nearest, distance, reach, spacing, partner, carrier, held, mark, out, count_of):
-    """Write the connected part of rows with most of what is ``held``.
+def connected_loop(places, rows, tested, which, spacing, link, plane, out):
+    """Whether tested points (N, 3), projected to a plane, are within so many spacings (N,) of some rows of places.
 
-    ``count_of`` (2,) gets its size, and without what segments carry.
-
-    ``nearest``, ``distance`` (M, n): neighbours of each row, itself first, as positions in ``rows``, and ``mark`` the
-    position of each row. Two are linked if they are nearer than ``reach`` times the larger of their spacings, and if
-    they are the two ends of a segment.
+    Only those ``which`` (K,) are tested; ``out`` (K,) is filled.
     """
-    number = len(rows)
-    parent = np.arange(number)
+    flat, at, home = np.empty((len(rows), 3)), np.empty(3), 0
+    nearest, squared = np.empty(1, np.int64), np.empty(1)
+    for k in range(len(rows)):
+        height = height_kernel(places[rows[k]], plane)
+        for c in range(3):
+            flat[k, c] = places[rows[k], c] - height * plane[c]
+    boxes = boxes_loop(flat)
+    for k in range(len(which)):
+        height, reach = height_kernel(tested[which[k]], plane), link * spacing[which[k]]
+        for c in range(3):
+            at[c] = tested[which[k], c] - height * plane[c]
+        found = nearest_loop(flat, boxes, at, home, reach * reach * _ROUNDING, nearest, squared)
+        out[k] = found > 0 and math.sqrt(squared[0]) <= reach
+        if found > 0:
+            home = nearest[0]
+
+
+@kernel
+def _root_kernel(parent, k):
+    while parent[k] != k:
+        parent[k] = parent[parent[k]]
+        k = parent[k]
+    return k
+
+
+@kernel
+def _join_kernel(parent, k, j):
+    a, b = _root_kernel(parent, k), _root_kernel(parent, j)
+    parent[max(a, b)] = min(a, b)
+
+
+@loop
+def linked_loop(places, spacing, partner, neighbours, rows, rank, reach, mark, parent):
+    """Link rows to their nearest: ``parent`` (M,) gets the first row of the part that each is in.
+
+    Two are linked if one is among the nearest ``rank`` of the other and not farther than ``reach`` times the larger of
+    their spacings, and if they are the two ends of a segment. ``mark`` holds the position of each row.
+    """
+    number, width, widest = len(rows), min(rank + 1, len(rows)), 0.0
+    nearest, squared = np.empty(width, np.int64), np.empty(width)
+    points, boxes = np.empty((number, 3)), np.empty((0, 6))
     for k in range(number):
-        for m in range(nearest.shape[1]):
-            other = partner[rows[k]] if m == 0 else rows[nearest[k, m]]
-            j = mark[other]
-            if j < 0 or j == k:
-                continue
-            if m > 0 and distance[k, m] > reach * max(spacing[rows[k]], spacing[other]):
-                continue
-            a, b = k, j
-            while parent[a] != a:
-                parent[a] = parent[parent[a]]
-                a = parent[a]
-            while parent[b] != b:
-                parent[b] = parent[parent[b]]
-                b = parent[b]
-            if a < b:
-                parent[b] = a
-            else:
-                parent[a] = b
-    size = np.zeros(number, np.int64)
+        parent[k] = k
+        widest = max(widest, spacing[rows[k]])
+        for c in range(3):
+            points[k, c] = places[rows[k], c]
+    for k in range(number):
+        i = rows[k]
+        if mark[partner[i]] >= 0:
+            _join_kernel(parent, k, mark[partner[i]])
+        count = 0
+        for m in range(neighbours.shape[1]):
+            if count < width and mark[neighbours[i, m]] >= 0:
+                nearest[count] = mark[neighbours[i, m]]
+                count += 1
+        if count < width:  # the others among its neighbours do not take part
+            if len(boxes) == 0:
+                boxes = boxes_loop(points)
+            bound = (reach * widest) ** 2 * _ROUNDING
+            count = nearest_loop(points, boxes, points[k], k, bound, nearest, squared)
+        for m in range(count):
+            j = nearest[m]
+            x, y, z = points[j, 0] - points[k, 0], points[j, 1] - points[k, 1], points[j, 2] - points[k, 2]
+            if math.sqrt(x * x + y * y + z * z) <= reach * max(spacing[i], spacing[rows[j]]):
+                _join_kernel(parent, k, j)
     for k in range(number):
         parent[k] = parent[parent[k]]  # parents come before their children
-        size[parent[k]] += held[rows[k]]
+
+
+@loop
+def connected_part_loop(places, spacing, partner, carrier, neighbours, rows, held, rank, reach, mark, out):
+    """Write the connected part of rows with most of what is ``held`` (K,); its size, and without what segments carry.
+
+    See :func:`linked_loop`. Fewer than three rows are one part with nothing in it.
+    """
+    number = len(rows)
+    if number < 3:
+        for k in range(number):
+            out[k] = rows[k]
+        return number, 0
+    parent, size = np.empty(number, np.int64), np.zeros(number, np.int64)
+    for k in range(number):
+        mark[rows[k]] = k
+    linked_loop(places, spacing, partner, neighbours, rows, rank, reach, mark, parent)
+    for k in range(len(held)):
+        if mark[held[k]] >= 0:
+            size[parent[mark[held[k]]]] += 1
     best = 0
     for k in range(1, number):
         if size[k] > size[best]:
             best = k
-    if number == 0 or size[best] == 0:
+    if size[best] == 0:
         best = -1
     for k in range(number):
         mark[rows[k]] = k if parent[k] == best else -1
@@ -257,12 +342,12 @@ def connected_part_loop(rows, nearest, distance, reach, spacing, partner, carrie
                 independent += 1
     for k in range(number):
         mark[rows[k]] = -1
-    count_of[0], count_of[1] = count, independent
+    return count, independent
 
 
 @loop
-def ball_loop(places, packed, carrier, order, balls, rows, center, radius, plane, gate, mark, out):
-    """Support in a ball, out[0], and how much would be in the layer by chance, out[1]; carried points do not count."""
+def ball_loop(places, packed, carrier, balls, rows, center, radius, plane, gate, mark):
+    """Support in a ball, and how much would be in the layer by chance; carried points do not count."""
     squared = radius * radius
     for k in range(len(rows)):
         i = rows[k]
@@ -274,8 +359,7 @@ def ball_loop(places, packed, carrier, order, balls, rows, center, radius, plane
         x, y, z = balls[b, 0] - center[0], balls[b, 1] - center[1], balls[b, 2] - center[2]
         if x * x + y * y + z * z > (radius + balls[b, 3]) ** 2:
             continue
-        for k in range(b * BALL, min((b + 1) * BALL, len(order))):
-            i = order[k]
+        for i in range(b * BALL, min((b + 1) * BALL, len(places))):
             carried = carrier[i] >= 0
             support = mark[i] >= 0 and not (carried and mark[carrier[i]] >= 0)
             if carried and not support:
@@ -288,4 +372,4 @@ def ball_loop(places, packed, carrier, order, balls, rows, center, radius, plane
             chance += min(math.sqrt(gate) * spread / max(radius, 1e-300), 1.0)
     for k in range(len(rows)):
         mark[rows[k]] = -1
-    out[0], out[1] = inside, chance
+    return inside, chance

@@ -25,7 +25,7 @@ from groma._typing import FloatArray, IntArray
 from groma.errors import ShapeError
 
 #: Cost: rounds of expectation maximisation.
-_ROUNDS = 30
+ROUNDS = 30
 #: Squared distances beyond this count as this, in variances: a density does not become zero (derived from the range of
 #: doubles).
 MAX_SQUARE = 1400.0
@@ -96,7 +96,7 @@ def inlier_probability(
     share = np.full(len(band), 0.5)
     probability = np.zeros(len(distance))
     # Some features in advance keep small structures from extremes.
-    _maximise(noise, clutter, owner.astype(np.int64), count, pooled, common, _ROUNDS, share, probability)
+    _maximise(noise, clutter, owner.astype(np.int64), count, pooled, common, ROUNDS, share, probability)
     return probability, share
 
 

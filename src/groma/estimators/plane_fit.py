@@ -76,6 +76,16 @@ def fit_plane(
     fit_loop(
         np.ascontiguousarray(points), packed, np.arange(len(points)), weights, iterations, plane, center, precision
     )
+    return fit_with_covariance(plane, center, points, precision, weights)
+
+
+def fit_with_covariance(
+    plane: FloatArray, center: FloatArray, points: FloatArray, precision: FloatArray, weights: FloatArray
+) -> PlaneFit:
+    """Return a plane of least squares through points (N, 3) with its covariance.
+
+    ``center`` is their mean by ``precision`` (N,), the ``weights`` (N,) over the variances across the plane.
+    """
     normal, away = plane[:3], points - center
     basis = np.stack(perpendicular(normal))
     slope = np.column_stack([away @ basis.T, np.ones(len(away))])

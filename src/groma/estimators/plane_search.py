@@ -25,9 +25,9 @@ from heapq import heapify, heappop, heappush
 
 import numpy as np
 
-from groma._typing import BoolArray, FloatArray, IntArray
+from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
-from groma.estimators._plane_candidates import Features, Scores, features_of, from_neighbours, from_segments
+from groma.estimators._plane_candidates import Scores, features_of, from_neighbours, from_segments
 from groma.estimators._plane_growth import Grower, Grown, connected_to
 from groma.estimators._plane_options import PLANE_SEARCH, PlaneOptions
 from groma.gates import chi_square_gate
@@ -135,13 +135,13 @@ def find_planes(
     return PlaneSet(
         planes=np.array([fit.plane for fit in fits]).reshape(-1, 4),
         covariance=np.array([fit.covariance for fit in fits]).reshape(-1, 4, 4),
-        support=np.array([len(grown.rows) for grown in found], dtype=np.int64),
+        support=np.array([len(grown.places) for grown in found], dtype=np.int64),
         share=np.array([grown.share for grown in found], dtype=np.float64),
         band=np.array([grown.band for grown in found], dtype=np.float64),
         log10_false_alarms=np.array([grown.log10_false_alarms for grown in found], dtype=np.float64),
         point_label=labels[: len(points)],
         segment_label=np.where(end_label[:, 0] == end_label[:, 1], end_label[:, 0], -1),
-        places=[places[grown.rows] for grown in found],
+        places=[grown.places for grown in found],
     )
 
 
@@ -151,13 +151,14 @@ def _extract(
     partner: IntArray,
     carrier: IntArray,
     num_points: int,
-    labels: IntArray,
+    filled: IntArray,
     options: PlaneOptions,
     progress: Callable[[int, int], None],
 ) -> list[Grown]:
-    """Take planes out one after the other; ``labels`` is filled."""
+    """Take planes out one after the other; ``filled`` gets their numbers."""
     rng = np.random.default_rng(options.seed)
     features = features_of(places, noise, partner, carrier)
+    labels = np.full(len(places), -1)
     gate = chi_square_gate(1.0 - options.level, 1)
     first, first_homes = from_neighbours(features, gate, rng)
     second, second_homes, num_pairs = from_segments(features, num_points, gate)
@@ -174,15 +175,12 @@ def _extract(
     grower = Grower(features, gate, float(log_tried), options)
     failures, scored = 0, np.zeros(len(candidates), np.int64)
     patience = max(PLANE_SEARCH.patience, len(candidates) // PLANE_SEARCH.candidates_per_failure)
-    at = np.argsort(homes, kind="stable")
-    first_at = np.searchsorted(homes[at], np.arange(len(places) + 1))
-    is_near = np.zeros(len(places), bool)
     while queue and failures < patience:
-        progress(len(candidates) - len(queue), len(candidates))
         _, best = heappop(queue)
         if not alive[best]:
             continue
         # Scores only fall while planes are taken out: the best is the best if its own is of after the last one.
+        progress(len(candidates) - len(queue), len(candidates))
         if scored[best] < len(found):
             stale = [best]
             while queue and len(stale) < _SCORED_TOGETHER and scored[queue[0][1]] < len(found):
@@ -202,37 +200,9 @@ def _extract(
             failures = 0
             labels[grown.taken] = len(found)
             found.append(grown)
-        if len(rows):
-            is_near[:] = False
-            is_near[features.neighbours[rows]] = True
-            around = np.flatnonzero(is_near)
-            left = at[_ranges(first_at[around], first_at[around + 1])]
-            left = left[alive[left]]
-            alive[left] = _are_other_planes(features, candidates[left], plane, rows)
+        scores.keep_others(plane, rows, alive)
+    filled[features.given] = labels
     return found
-
-
-def _are_other_planes(features: Features, candidates: FloatArray, plane: FloatArray, rows: IntArray) -> BoolArray:
-    """Tell which candidates would not end at a plane that was found, and are worth a try."""
-    some = features.places[rows[:: max(1, len(rows) // 64)]]
-    height = np.abs(some @ candidates[:, :3].T + candidates[:, 3])
-    return _median_above(height, PLANE_SEARCH.same * float(np.median(features.spread(plane[:3], rows))))
-
-
-def _ranges(begin: IntArray, end: IntArray) -> IntArray:
-    """Numbers from each begin to before its end, one after the other."""
-    count = end - begin
-    return np.repeat(begin - np.cumsum(count) + count, count) + np.arange(int(count.sum()))
-
-
-def _median_above(values: FloatArray, limit: float) -> BoolArray:
-    """Whether the medians of columns are above a limit."""
-    above = 2 * np.count_nonzero(values > limit, axis=0)
-    if len(values) % 2:
-        return above > len(values)
-    even = above == len(values)
-    above[even] += np.median(values[:, even], axis=0) > limit
-    return above > len(values)
 
 
 __all__ = ["BAND", "PlaneOptions", "PlaneSet", "connected_to", "find_planes"]
