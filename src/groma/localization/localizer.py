@@ -275,7 +275,11 @@ def _folder(map_: object, images: str | os.PathLike[str] | None, index: Path | N
 
 def photographs_of(map_: str | os.PathLike[str], images: str | os.PathLike[str] | None = None) -> Path:
     """Return the folder of the photographs of a map: as given, or as it tells; InputError where it does not."""
-    return _folder(map_, images, index_file(Path(map_)))
+    try:
+        return _folder(map_, images, index_file(Path(map_)))
+    except InputError:
+        read_scene(map_)  # what is no map at all tells nothing of photographs, either
+        raise
 
 
 def unknown_camera(width: int, height: int) -> QueryCamera:
@@ -287,7 +291,7 @@ def unknown_camera(width: int, height: int) -> QueryCamera:
 def index_file(map_: Path) -> Path:
     """Return the file beside a map in which its descriptions are kept."""
     path = map_.absolute()
-    return path.with_name(f"{path.name}.index.npz")
+    return path.parent / f"{path.name}.index.npz"
 
 
 def check_map(scene: Scene) -> None:

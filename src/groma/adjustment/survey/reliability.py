@@ -57,6 +57,7 @@ from groma.problem.problem import Problem
 from groma.problem.residuals import jacobians_of
 from groma.problem.variables import Variables
 from groma.scene import Scene
+from groma.scene.checks import check_scene_given
 from groma.scene.local_frame import local_frame
 from groma.scene.survey import accepted, only_rejected
 from groma.solver.covariance.marginals import Covariances
@@ -100,6 +101,7 @@ def reliability(
     ProblemError
         If the poses are not determined.
     """
+    check_scene_given(scene)
     if not scene.has_survey:
         return None
     near = local_frame(scene)
