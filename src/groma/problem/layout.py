@@ -126,6 +126,8 @@ class FactorLayout:
     landmark_column: int = -1
     #: (N,) position of each factor's landmark; empty if there is none.
     landmark: IntArray = field(default_factory=lambda: np.zeros(0, np.int32))
+    #: Its number among the groups of the problem.
+    number: int = -1
 
 
 @dataclass(frozen=True)
@@ -154,6 +156,8 @@ class Layout:
     blocks: dict[tuple[int, int], tuple[IntArray, IntArray]]
     num_direct: dict[tuple[int, int], int]
     warnings: list[str] = field(default_factory=list)
+    #: Layouts in which some groups of landmarks move alone, found so far, and the groups of factors that they have.
+    of_landmarks: dict[tuple[str, ...], tuple[Layout, tuple[int, ...]]] = field(default_factory=dict)
 
     @property
     def num_kept_unknowns(self) -> int:

@@ -20,6 +20,7 @@ import numpy as np
 from groma._simd import width
 from groma._typing import FloatArray
 from groma.problem._records import chain_rule, cost_scaled, cost_whitened, mask, weigh, whiten
+from groma.problem._room import room_for_chunks, room_for_sums
 from groma.problem._sums import add_block, add_cross, add_incidence, add_primary
 from groma.problem.layout import Chunk, FactorLayout, Layout
 from groma.problem.parallel import Workers, shares_of, sum_of
@@ -78,17 +79,9 @@ class NormalEquations:
             if free is not None:
                 order = next((e.order for e in layout.eliminated if e.group == name), None)
                 self._free[name] = np.ascontiguousarray(free if order is None else free[order])
-        self.V = [np.zeros(e.count * e.dof * e.dof) for e in layout.eliminated]
-        self.g_landmarks = [np.zeros(e.count * e.dof) for e in layout.eliminated]
-        self.W = [
-            {
-                c: np.zeros(len(i.block) * e.dof * layout.kept[c].width, np.float32 if compact else np.float64)
-                for c, i in e.incidences.items()
-            }
-            for e in layout.eliminated
-        ]
+        self.V, self.g_landmarks, self.W = room_for_sums(layout, compact)
         self._chunk_W: list[list[dict[int, Any]]] = [
-            self._room_for_chunks() if compact else self.W for _ in self.shares
+            room_for_chunks(layout) if compact else self.W for _ in self.shares
         ]
         self._alone = [
             {c: _has_one_source(layout, number, c) for c in e.incidences} for number, e in enumerate(layout.eliminated)
@@ -263,21 +256,6 @@ class NormalEquations:
             begin, end = incidences.pointer[chunk.begin], incidences.pointer[chunk.end]
             W, first = self.blocks_of_chunk(share, chunk, c)
             W[(begin - first) * size : (end - first) * size] = 0.0
-
-    def _room_for_chunks(self) -> list[dict[int, Any]]:
-        """Room for the part of W of any one chunk."""
-        room = []
-        for e, group in enumerate(self.layout.eliminated):
-            most = {
-                c: max(
-                    i.pointer[chunk.end] - i.pointer[chunk.begin]
-                    for chunk in self.layout.chunks
-                    if chunk.eliminated == e
-                )
-                for c, i in group.incidences.items()
-            }
-            room.append({c: np.zeros(n * group.dof * self.layout.kept[c].width) for c, n in most.items()})
-        return room
 
     def blocks_of_chunk(self, share: int, chunk: Chunk, kept_class: int) -> tuple[FloatArray, int]:
         """Return an array with the blocks W of a chunk, in double precision, and the incidence it begins with."""

@@ -23,7 +23,7 @@ from groma.solver.damped_problem import Trial
 from groma.solver.linear.schur import MIN_DIAGONAL, invert_blocks
 from groma.solver.options import SolverOptions, first_damping
 from groma.solver.report import SolveReport, Stopwatch, note_costs
-from groma.solver.steps import States, landmark_slopes
+from groma.solver.steps import States
 from groma.solver.termination import Termination
 
 #: A variable whose damping exceeds this has reached its minimum to machine precision.
@@ -86,6 +86,7 @@ class IndependentBlocks:
         self._initial_damping = initial_damping
         self._max_damping = MAX_DAMPING if initial_damping > 0.0 else 0.0
         self._singular: dict[tuple[int, int], int] = {}
+        self._steepest: dict[tuple[int, int], float] = {}
         self.reset()
 
     @property
@@ -125,7 +126,7 @@ class IndependentBlocks:
 
     def largest_gradient(self) -> float:
         """Return the largest component of the gradient, each over the root of its curvature."""
-        return max(landmark_slopes(self.equations), default=0.0)
+        return float(np.sqrt(np.max([*self._steepest.values()], initial=0.0)))
 
     def advance(self, states: States, costs: list[FloatArray]) -> tuple[States, list[FloatArray], BlockProgress]:
         """Take the step of every variable from where they were linearised, if it lowers the variable's cost."""
@@ -179,7 +180,7 @@ class IndependentBlocks:
         if e is not None:
             V, g = self.equations.V[e], self.equations.g_landmarks[e]
             dof = width(self.layout.eliminated[e].dof)
-            self._singular[e, chunk.begin] = invert_blocks(
+            self._singular[e, chunk.begin], self._steepest[e, chunk.begin] = invert_blocks(
                 V, g, self.damping[e], 1, chunk.begin, chunk.end, self._N[e], self._h[e], dof
             )
 
