@@ -18,6 +18,7 @@ from groma._typing import IntArray
 from groma.problem._draft import Draft
 from groma.problem._partition import choose_landmarks, kept_classes
 from groma.problem.layout import (
+    CHUNK_SIZE,
     Chunk,
     Eliminated,
     FactorLayout,
@@ -28,8 +29,9 @@ from groma.problem.problem import Problem, under_loss
 from groma.problem.sorting import PairTable, argsort_by, distinct_pairs, first_and_last
 from groma.problem.tied import Divided, with_tied_apart
 
-#: Factors per chunk: their records (a few hundred bytes each) should fit the second-level cache (cost: time alone).
-CHUNK_SIZE = 4096
+#: Factors per chunk where no variable shares a factor with another: what has converged is left alone, chunk by chunk.
+#: Those that follow each other are done together (cost: time alone).
+CHUNK_ALONE = 512
 
 
 def lay_out(problem: Problem, eliminate: str | tuple[str, ...] = "auto", chunk_size: int = CHUNK_SIZE) -> Layout:
@@ -52,7 +54,7 @@ def lay_out(problem: Problem, eliminate: str | tuple[str, ...] = "auto", chunk_s
     for e, group in enumerate(landmarks):
         eliminated.append(_incidences(problem, group, e, orders[group][0], layouts, kept, tables))
     blocks = {pair: table.pairs() for pair, table in tables.items() if table.count}
-    chunks = _chunks(layouts, eliminated, chunk_size)
+    chunks = _chunks(layouts, eliminated, chunk_size if kept else min(chunk_size, CHUNK_ALONE))
     return Layout(
         problem, kept, tuple(eliminated), tuple(layouts), chunks, blocks, {p: num_direct[p] for p in blocks}, warnings
     )

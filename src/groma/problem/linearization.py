@@ -22,7 +22,7 @@ from groma._typing import FloatArray
 from groma.problem._records import chain_rule, cost_scaled, cost_whitened, mask, weigh, whiten
 from groma.problem._room import room_for_chunks, room_for_sums
 from groma.problem._sums import add_block, add_cross, add_incidence, add_primary
-from groma.problem.layout import Chunk, FactorLayout, Layout
+from groma.problem.layout import CHUNK_SIZE, Chunk, FactorLayout, Layout, in_runs
 from groma.problem.parallel import Workers, shares_of, sum_of
 
 States = Mapping[str, FloatArray]
@@ -69,6 +69,10 @@ class NormalEquations:
         for chunk in layout.chunks:
             for f, begin, end in chunk.factors:
                 self._sizes[f] = max(self._sizes[f], end - begin)
+        if not layout.kept:
+            self._sizes = [
+                max(n, min(CHUNK_SIZE, len(f.factor))) for n, f in zip(self._sizes, layout.factors, strict=True)
+            ]
         self.shares = shares_of(layout)
         self._scratch = threading.local()  # one per thread, not per share: it stays in cache
         self._references = [tuple(ref for _, ref in factor.factor.references()) for factor in layout.factors]
@@ -152,13 +156,15 @@ class NormalEquations:
     def _runs(self, share: int, wanted: Callable[[Chunk], bool] | None) -> Iterator[tuple[int, int, int]]:
         """Yield factor group, begin and end of factors of many chunks: costs need less room than records."""
         runs: dict[int, tuple[int, int]] = {}
+        room = [len(self._record(f)) // (one.factor.residual_size + 1) for f, one in enumerate(self.layout.factors)]
         for chunk in self.shares[share]:
             if wanted is not None and not wanted(chunk):
                 continue
-            for f, begin, end in (piece for piece in chunk.factors if piece[1] < piece[2]):
+            for f, begin, end in chunk.factors:
+                if begin == end:
+                    continue
                 first, last = runs.get(f, (begin, begin))
-                size = self.layout.factors[f].factor.residual_size
-                if last != begin or (end - first) * (size + 1) > len(self._record(f)):
+                if last != begin or end - first > room[f]:
                     yield f, first, last
                     first = begin
                 runs[f] = first, end
@@ -221,9 +227,9 @@ class NormalEquations:
                 H[:] = 0.0
             for g in self._g[share]:
                 g[:] = 0.0
-            for chunk in self.shares[share]:
-                if wanted is not None and not wanted(chunk):
-                    continue
+            chosen = (chunk for chunk in self.shares[share] if wanted is None or wanted(chunk))
+            for chunks in in_runs(chosen, 0 if self.layout.kept else CHUNK_SIZE):
+                chunk = chunks[0].up_to(chunks[-1])
                 self._clear(share, chunk)
                 for f, begin, end in chunk.factors:
                     if begin < end:
@@ -231,7 +237,8 @@ class NormalEquations:
                         costs[f] += cost
                         degenerate[f] += count
                 if after_chunk is not None and chunk.eliminated is not None:
-                    after_chunk(share, chunk)
+                    for part in chunks:
+                        after_chunk(share, part)
                 if self.compact and chunk.eliminated is not None:
                     self._round(share, chunk)
             return costs, degenerate
