@@ -36,6 +36,12 @@ def test_nothing_heavy_is_loaded(code):
     assert not _loaded_after(code) & {*HEAVY, "numpy"}
 
 
+def test_the_entry_point_loads_only_what_python_has_loaded():
+    """Ctrl-C is answered once it is loaded; gc and zlib are parts of the interpreter."""
+    mine = _loaded_after("import gc, zlib\nfrom groma.cli.main import main") - _loaded_after("import gc, zlib")
+    assert mine == {"groma", "groma._version", "groma.cli", "groma.cli.main"}
+
+
 def test_the_viewer_is_loaded_only_when_asked_for():
     assert "viser" not in _loaded_after("import groma\ngroma.adjust\ngroma.read_scene")
 

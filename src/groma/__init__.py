@@ -7,7 +7,6 @@ costs next to nothing. Sub-packages are reachable the same way: ``groma.geometry
 """
 
 import zlib as _zlib  # noqa: F401  (before pycolmap, whose library hides Python's own deflate and breaks it)
-from importlib import import_module
 
 from groma._version import __version__ as __version__
 
@@ -234,6 +233,8 @@ _SUBPACKAGES = set(__all__) - _HOME.keys()
 
 
 def __getattr__(name: str) -> object:
+    from importlib import import_module  # not before: a command answers Ctrl-C once this file is loaded
+
     if name in _HOME:
         value = getattr(import_module(_HOME[name]), _RENAMED.get(name, name))
     elif name in _SUBPACKAGES:

@@ -261,7 +261,11 @@ def test_images_that_are_not_there_are_told(truth_and_start):
     given = measured_positions(truth, np.random.default_rng(5))
     found = with_survey(truth.subset(range(6)), Survey(positions=given))
     assert len(found.scene.camera_positions) == 6
-    assert any("2 positions of images that are not in the scene: 00007.png" in note for note in found.notes)
+    told = "2 positions of images that are not in the scene: "
+    assert any(told + "00007.png, 00008.png." in note for note in found.notes)  # each other image has its own name
+    mistyped = replace(given, names=("0001.png", *given.names[1:]))
+    found = with_survey(truth.subset(range(6)), Survey(positions=mistyped))
+    assert any("not in the scene: 0001.png (nearest: 00001.png), 00007.png" in note for note in found.notes)
 
 
 def test_a_scene_in_place_stays(truth_and_start):

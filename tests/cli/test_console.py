@@ -4,6 +4,7 @@
 import os
 import re
 import sys
+from types import SimpleNamespace
 
 import pytest
 
@@ -37,6 +38,27 @@ def test_parts_and_the_time_left():
     assert parts_done("finding lines", 100, 100, 10.0) == "100/100"
     assert parts_done("tracking frame", 1234, 0, 10.0) == "1,234"  # how many there are is not known
     assert parts_done("adjusting points", 7, 50, 10.0) == "step 7 of at most 50"  # it ends when it has converged
+
+
+def test_the_time_left_leaves_out_what_was_compiled(monkeypatch):
+    """Ten parts of two seconds; the first and the fourth wait for a minute until a function is compiled."""
+    now, said = [0.0], []
+    counts = SimpleNamespace(missed=0, compiled=0, unsaved=0)
+    monkeypatch.setitem(sys.modules, "groma._kernels.cache", SimpleNamespace(counts=counts))
+    monkeypatch.setattr(_progress.time, "perf_counter", lambda: now[0])
+    stages = Console(False, False, None).stages()
+    monkeypatch.setattr(stages, "_show", lambda label, parts, share: said.append(parts))
+    stages("finding lines", 0, 10)
+    for done in range(1, 11):
+        now[0] += 2.0
+        if done in (1, 4):
+            now[0] += 60.0
+            counts.missed += 1
+        stages("finding lines", done, 10)
+    assert said == [
+        "0/10", "1/10", "2/10, 16 s left", "3/10, 14 s left", "4/10", "5/10, 10 s left",
+        "6/10, 8 s left", "7/10, 6 s left", "8/10, 4 s left", "9/10, 2 s left", "10/10",
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("width", [30, 60, 80, 120])

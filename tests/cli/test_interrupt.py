@@ -129,6 +129,34 @@ def test_a_signal_while_a_package_is_imported_is_an_interrupt(tmp_path, number, 
     assert os.listdir(tmp_path) == ["in"]
 
 
+BEFORE = """
+import os, signal, sys
+from groma.cli.main import main
+
+class Loader:
+    def find_spec(self, name, path=None, target=None):
+        if name == "groma.cli.shared.interrupt":
+            sys.meta_path.remove(self)
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Loader())
+sys.argv = ["groma", "--version"]
+main()
+"""
+
+
+def test_a_signal_before_signals_are_answered_is_an_interrupt():
+    finished = subprocess.run(
+        [sys.executable, "-c", BEFORE],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    assert (finished.returncode, finished.stdout) == (130, "")
+    assert finished.stderr == "groma: interrupted; nothing is left half written.\n"
+
+
 def test_sigterm_after_pycolmap_is_loaded_is_an_interrupt():
     program = (
         "import os, signal, time\n"

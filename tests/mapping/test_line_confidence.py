@@ -12,7 +12,6 @@ from groma.io.archive import read_archive, write_archive
 from groma.mapping.lines.confidence import (
     GATES,
     WEIGHTS,
-    left_out,
     line_accuracy,
     line_confidence,
     line_evidence,
@@ -155,12 +154,6 @@ def test_kept_in_archives(scene, tmp_path):
         assert "lines.confidence" not in saved.files
     assert (read_archive(tmp_path / "old.npz").lines.confidence == -1).all()
     assert len(line_confidence(Scene())) == 0
-
-
-def test_what_was_left_out_is_said():
-    assert left_out(np.ones(3, bool), 0.5) == ""
-    assert left_out(np.array([True, False, False]), 0.7).startswith(" 2 lines were left out")
-    assert "below 0.5" in left_out(np.array([False]), 0.5)
 
 
 def test_the_command_has_the_default_of_the_library():

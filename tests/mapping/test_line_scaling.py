@@ -155,7 +155,20 @@ def test_explanation_of_a_map_names_the_largest_groups_and_counts_the_rest():
             num_lines=1200,
         )
     )
-    assert text.startswith("1,200 lines from 5,500 of 8,530 segments in 1 image. Of the other segments: 900 (11 %) had")
+    head, rest = text.split(". ", 1)
+    assert head == "1,200 lines from 5,500 of 8,530 segments in 1 image"
+    assert rest.startswith("Of the segments on no line: 900 (11 %) had")
     assert "30 (under 1 %) were lost for other reasons" in text
     assert text.endswith("What would help most: more photographs of the same parts.")
     assert "empty" not in text
+
+
+def test_explanation_counts_the_lines_of_the_map_first():
+    mapped = line_map({Outcome.MAPPED: 50, Outcome.NO_MATCH: 30}, num_lines=12)
+    assert explain(mapped).startswith("12 lines from 50 of 80 segments in 1 image. Of the segments on no line: 30")
+    assert explain(mapped, 5, 0.5).startswith(
+        "7 lines, of 12 from 50 of 80 segments in 1 image: 5 are left out, right with a probability below 0.5 "
+        "(--min-confidence). Of the segments on no line: 30"
+    )
+    assert explain(mapped, 11, 0.8).startswith("1 line, of 12 from 50 of 80 segments in 1 image: 11 are left out")
+    assert ": 1 is left out" in explain(mapped, 1, 0.8)

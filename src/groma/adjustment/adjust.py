@@ -15,6 +15,7 @@ from groma._typing import FloatArray
 from groma.adjustment.assemble import Assembly, AssemblyOptions, assemble, disassemble
 from groma.adjustment.assembly_options import SURFACE_SIGMA_PX
 from groma.adjustment.fit import inliers, noise_of
+from groma.adjustment.misfit.calibration import doubtful_cameras, refuse_focal_lengths
 from groma.adjustment.misfit.lens import unmodelled_distortion
 from groma.adjustment.misfit.rig import rig_that_does_not_fit
 from groma.adjustment.pixel_residuals import redundancy_of, squared_residuals_px
@@ -161,6 +162,7 @@ def adjust(
             f"adjust takes a groma.Scene; got {type(scene).__name__}. Read one with groma.read_scene(path), or turn a "
             "pycolmap.Reconstruction into one with groma.io.from_pycolmap(reconstruction)."
         )
+    refuse_focal_lengths(scene)
     if options.camera_model is not None:
         scene, options = _in_model(scene, options, options.camera_model, progress)
     near = local_frame(scene)
@@ -296,7 +298,7 @@ def _outcome(
         solve=report,
         relations=relations,
         stages=stages,
-        warnings=(*assembly.notes, *not_converged(report), *report.warnings),
+        warnings=(*doubtful_cameras(scene), *assembly.notes, *not_converged(report), *report.warnings),
     )
 
 

@@ -29,7 +29,7 @@ from groma.execution import beside
 from groma.factors.losses import GemanMcClure, Loss, loss
 from groma.io import atomic_output, write_geometry, write_scene
 from groma.mapping.depth.points import MeasuredDepths
-from groma.mapping.lines.confidence import left_out, line_confidence
+from groma.mapping.lines.confidence import line_confidence
 from groma.mapping.lines.intervals import with_supported_intervals
 from groma.mapping.lines.line_map import LineMap, explain
 from groma.mapping.surveyed import survey_numbers
@@ -249,7 +249,7 @@ def result_of(
         report=adjusted.report,
         adjusted_with=weighted,
         sigma_px={"points": weighted.point_sigma_px, "lines": weighted.line_sigma_px},
-        explanation=explain(line_map) + left_out(kept, min_confidence),
+        explanation=explain(line_map, int((~kept).sum()), min_confidence),
         outcomes={outcome.name.lower(): count for outcome, count in line_map.outcome_counts().items()},
         warnings=(*missing, *adjusted.report.warnings),
     )

@@ -46,6 +46,12 @@ class Cameras(Table, noun="camera"):
                 )
         if len(self) and min(self.width.min(), self.height.min()) < 0:
             raise InputError("Cameras.width and height must not be negative; use 0 where the size is unknown.")
+        if len(half := np.flatnonzero((self.width == 0) != (self.height == 0))):
+            row = half[0]
+            raise InputError(
+                f"Camera {self.ids[row]} has {self.width[row]} x {self.height[row]} pixels; width and height must "
+                "both be positive, or both 0."
+            )
 
     @property
     def num_params(self) -> list[int]:

@@ -110,10 +110,12 @@ def sigma_of(given: Places, stated: tuple[float, ...], option: str, needed: Any 
 
 
 def tell_unknown(given: Places, rows: IntArray, known: Sequence[str], words: str, notes: list[str]) -> None:
-    """Say which names of a file the scene does not know."""
+    """Say which names of a file the scene does not know, and which image without a measurement each may mean."""
     unknown = [given.names[row] for row in np.flatnonzero(rows < 0)]
     if unknown:
-        listed = [name + nearest(name, known) for name in unknown[:_LISTED]]
+        named = set(rows.tolist())
+        free = [name for row, name in enumerate(known) if row not in named]
+        listed = [name + nearest(name, free) for name in unknown[:_LISTED]]
         more = f" and {len(unknown) - _LISTED} more" if len(unknown) > _LISTED else ""
         notes.append(f"{given.source}: {counted(len(unknown), 'positions')} of {words}: {', '.join(listed)}{more}.")
 

@@ -86,13 +86,23 @@ class Stages(Line):
         self._finished = finished
         self._stage = self._label = ""
         self._since = time.perf_counter()
+        #: From when on, and from how many parts on, the time that is left is estimated.
+        self._from = self._since, 0
+        self._compiled = _functions_compiled()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         """Show a stage."""
+        compiled = _functions_compiled()
         if stage != self._stage:
             self._leave()
             self._stage, self._label = stage, self._plan.label(stage)
-        parts = parts_done(stage, done, total, time.perf_counter() - self._since)
+            self._from = self._since, done
+        elif compiled != self._compiled or done < self._from[1]:
+            # What was compiled is there for the parts that are left: they are counted from here on.
+            self._from = time.perf_counter(), done
+        self._compiled = compiled
+        begin, first = self._from
+        parts = parts_done(stage, done, total, time.perf_counter() - begin, first)
         share = done / total if total > 1 and not _has_steps(stage) else None
         self._show(self._label, parts, share)
 
@@ -112,8 +122,8 @@ class Stages(Line):
         self._since = now
 
 
-def parts_done(stage: str, done: int, total: int, seconds: float) -> str:
-    """Return how far a stage is, in words; nothing if it has no parts.
+def parts_done(stage: str, done: int, total: int, seconds: float, first: int = 0) -> str:
+    """Return how far a stage is, in words; nothing if it has no parts. ``seconds`` went into those after ``first``.
 
     An adjustment ends when it has converged, so its steps tell nothing about the time that is left.
     """
@@ -121,8 +131,14 @@ def parts_done(stage: str, done: int, total: int, seconds: float) -> str:
         return f"step {done} of at most {total}" if done else ""
     if total <= 1:
         return f"{done:,}" if total == 0 and done else ""
-    told = 0 < done < total and seconds > _EARLY
-    return f"{done:,}/{total:,}" + (f", {say_seconds(seconds * (total - done) / done)} left" if told else "")
+    told = first < done < total and seconds > _EARLY
+    return f"{done:,}/{total:,}" + (f", {say_seconds(seconds * (total - done) / (done - first))} left" if told else "")
+
+
+def _functions_compiled() -> tuple[int, ...]:
+    """Return numbers that change when this process compiles a function, or waits for another that does."""
+    cache = sys.modules.get("groma._kernels.cache")
+    return () if cache is None else (cache.counts.missed, cache.counts.compiled, cache.counts.unsaved)
 
 
 def _has_steps(stage: str) -> bool:

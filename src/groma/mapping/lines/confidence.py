@@ -70,15 +70,6 @@ def with_confidence(scene: Scene) -> Scene:
     return scene.replace(lines=scene.lines.replace(confidence=line_confidence(scene)))
 
 
-def left_out(kept: BoolArray, min_confidence: float) -> str:
-    """Say how many lines did not reach a probability; empty where all did."""
-    count = int((~kept).sum())
-    if not count:
-        return ""
-    are = "line was" if count == 1 else "lines were"
-    return f" {count:,} {are} left out: right with a probability below {min_confidence:g} (--min-confidence)."
-
-
 def line_confidence(scene: Scene) -> FloatArray:
     """Return the probability (L,) that each line is right."""
     noise = line_noise(scene)

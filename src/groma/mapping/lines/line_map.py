@@ -79,8 +79,11 @@ class LineMap:
         return with_supported_intervals(lines)
 
 
-def explain(line_map: LineMap) -> str:
-    """Say in words how many segments were mapped, where the others were lost, and what would help."""
+def explain(line_map: LineMap, num_left_out: int = 0, min_confidence: float = 0.0) -> str:
+    """Say in words how many segments were mapped, where the others were lost, and what would help.
+
+    ``num_left_out`` lines did not reach the probability ``min_confidence`` and are no part of the map.
+    """
     counts = line_map.outcome_counts()
     total = sum(counts.values())
     if not line_map.outcomes:
@@ -91,8 +94,14 @@ def explain(line_map: LineMap) -> str:
             "length (--min-length) finds shorter ones."
         )
     mapped = counts[Outcome.MAPPED] + counts[Outcome.RECOVERED]
-    number = f"{line_map.num_lines:,} {'line' if line_map.num_lines == 1 else 'lines'}"
-    head = f"{number} from {mapped:,} of {total:,} segments in {_images(len(line_map.outcomes))}."
+    source = f"from {mapped:,} of {total:,} segments in {_images(len(line_map.outcomes))}"
+    head = f"{_lines(line_map.num_lines)} {source}."
+    if num_left_out:
+        head = (
+            f"{_lines(line_map.num_lines - num_left_out)}, of {line_map.num_lines:,} {source}: {num_left_out:,} "
+            f"{'is' if num_left_out == 1 else 'are'} left out, right with a probability below {min_confidence:g} "
+            "(--min-confidence)."
+        )
     lost = sorted(((n, outcome) for outcome, n in counts.items() if outcome > Outcome.RECOVERED and n), reverse=True)
     if not lost:
         return head
@@ -100,8 +109,12 @@ def explain(line_map: LineMap) -> str:
     others = sum(n for n, _ in lost[_NAMED:])
     if others:
         parts.append(f"{others:,} ({_percent(others, total)}) were lost for other reasons")
-    start = "The map is empty" if line_map.num_lines == 0 else "Of the other segments"
+    start = "The map is empty" if line_map.num_lines == 0 else "Of the segments on no line"
     return f"{head} {start}: {'; '.join(parts)}. What would help most: {REMEDIES[lost[0][1]]}."
+
+
+def _lines(number: int) -> str:
+    return f"{number:,} {'line' if number == 1 else 'lines'}"
 
 
 def _images(number: int) -> str:

@@ -34,7 +34,8 @@ from groma.mapping.groups import num_distinct
 from groma.mapping.noise.landmarks import LineNoise, PointNoise, line_noise, point_noise
 from groma.mapping.structure.angles import Vector, angles_between, vertical_of
 from groma.mapping.structure.junctions import meetings
-from groma.mapping.structure.relations import Landmarks, Pairs, on_lines, on_planes, spacings
+from groma.mapping.structure.relations import Landmarks, Pairs, on_lines, spacings
+from groma.mapping.structure.rough_planes import on_fitted_planes
 from groma.scene import Directions, Held, Planes, Relations, Scene
 from groma.scene.survey import Kind
 
@@ -156,10 +157,11 @@ def detect_structure(
         planes = _planes_in(marks, on_line, options, partial(report, "finding planes"))
         report("finding directions", 0, 1)
     report("finding what lies on what", 0, 1)
-    point_on_plane, line_on_plane = on_planes(marks, planes, level, (least, least_line))
+    enough = options.planes.min_support
+    planes, point_on_plane, line_on_plane = on_fitted_planes(marks, planes, level, (least, least_line), enough)
     (directions, along), meeting = told[0]
     support = point_on_plane.counts(len(planes)) + 2 * line_on_plane.counts(len(planes))
-    planes, new = _only(planes, support >= (options.planes.min_support + 1) // 2)
+    planes, new = _only(planes, support >= (enough + 1) // 2)
     found = {"point_on_plane": point_on_plane.renumbered(new), "line_on_plane": line_on_plane.renumbered(new)}
     found["line_along_direction"] = along
     found["point_on_line"] = on_line if options.points_on_lines else Pairs.none()
