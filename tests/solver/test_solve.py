@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from problems import INTRINSICS, dense_normal_equations, pixels_of, scene_problem
 
+import groma.problem.lay_out as lay_out_module
 import groma.solver.joint as joint_module
 import groma.solver.linear.schur as schur_module
 from groma.errors import InputError, ProblemError
@@ -321,6 +322,54 @@ def test_what_a_landmark_becomes_does_not_depend_on_the_others():
     together, alone = (solve(Problem(problem.variables, [f]), options)["points"] for f in (factor, few))
     np.testing.assert_allclose(together[:10], alone[:10], rtol=1e-12)
     np.testing.assert_array_equal(alone[10:], problem.variables["points"].state[10:])
+
+
+@pytest.mark.parametrize("size", [1, 3, 4096])
+def test_what_a_landmark_becomes_does_not_depend_on_the_chunks(size, monkeypatch):
+    """Chunks with a landmark that has not converged are done in runs; whatever their size, all bits are the same."""
+    problem = scene_problem(constant_poses=True, num_points=30, num_lines=8, disturb=0.05)
+    expected = solve(problem)
+    monkeypatch.setattr(lay_out_module, "CHUNK_ALONE", size)
+    found = solve(problem)
+    assert found.report.iterations == expected.report.iterations > 2
+    for name in ("points", "lines"):
+        np.testing.assert_array_equal(found[name], expected[name])
+
+
+def test_a_layout_serves_other_states_and_losses_alone(monkeypatch):
+    """A second solve with the same layouts gives the same bits as one without, and other factors are laid out anew."""
+    laid_out = []
+    lay_out = lay_out_module.lay_out
+    monkeypatch.setattr(lay_out_module, "lay_out", lambda *given: laid_out.append(given) or lay_out(*given))
+    options = SolverOptions(landmark_steps=1)
+    problem = scene_problem(num_lines=8, disturb=0.03)
+    layouts = lay_out_module.Layouts()
+    first = solve(problem, options, layouts=layouts).problem
+    assert len(laid_out) == 2  # of all, and of the landmarks that take steps of their own
+    other = first.with_losses([Cauchy(0.5)] * len(first.factors))
+    again = solve(other, options, layouts=layouts)
+    assert len(laid_out) == 2
+    anew = solve(other, options)
+    for name in ("poses", "points", "lines"):
+        np.testing.assert_array_equal(again[name], anew[name])
+    assert again.report.initial_costs == anew.report.initial_costs
+    held = {**other.variables, "poses": dataclasses.replace(other.variables["poses"], constant=True)}
+    fewer = Problem(other.variables, [factor.take(np.arange(len(factor) - 1)) for factor in other.factors])
+    for changed in (Problem(held, other.factors), fewer):
+        before = len(laid_out)
+        found, wanted = solve(changed, options, layouts=layouts), solve(changed, options)
+        assert len(laid_out) > before + 1
+        np.testing.assert_array_equal(found["points"], wanted["points"])
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_the_gradient_that_is_told_is_the_largest(held):
+    """Each component over the root of its diagonal entry of the normal equations, from a dense Jacobian."""
+    problem = scene_problem(num_lines=4, disturb=0.03, constant_poses=held)
+    H, g, _ = dense_normal_equations(problem)
+    expected = float(np.max(np.abs(g) / np.sqrt(np.diag(H))))
+    told = solve(problem, SolverOptions(max_iterations=1)).report.history[0].gradient_max
+    assert told == pytest.approx(expected, rel=1e-9)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -40,7 +40,9 @@ from groma.adjustment.terms.objects import with_held_states
 from groma.errors import InputError
 from groma.factors.losses import GemanMcClure, Loss, Trivial
 from groma.factors.losses import loss as make_loss
+from groma.problem.lay_out import Layouts
 from groma.problem.problem import Problem
+from groma.problem.residuals import Residuals
 from groma.scene import Scene
 from groma.scene.checks import check_scene_given
 from groma.scene.local_frame import local_frame
@@ -204,7 +206,7 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
             f"{scene.num_point_observations:,} point and {scene.num_line_observations:,} line observations, and the "
             "options leave none of them. Check the input and --no-points / --no-lines."
         )
-    problem, reports, moved = assembly.problem, [], []
+    problem, reports, moved, layouts = assembly.problem, [], [], Layouts()
     for number, loss in enumerate(stages):
         last = number + 1 == len(stages)
         spent = sum(report.iterations for report in reports)
@@ -230,7 +232,9 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
 
         if last and number:
             loss = stages[number] = _wide_enough(loss, replace(assembly, problem=problem))
-        solution = solve(with_loss(problem, loss, relation_loss, options.line_loss_factor), solver_options, tell)
+        solution = solve(
+            with_loss(problem, loss, relation_loss, options.line_loss_factor), solver_options, tell, layouts
+        )
         problem = solution.problem
         reports.append(solution.report)
         if stopped:
@@ -247,9 +251,10 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
     adjusted, relations = drop_failed_relations(disassemble(scene, problem), problem)
     if any(map(len, moved)):
         adjusted = with_seen_ends(adjusted, np.unique(np.concatenate(moved)))
-    outcome = _outcome(scene, assembly, problem, report, relations, stage_entries(stages, reports))
+    entries, residuals = stage_entries(stages, reports), Residuals(problem)
+    outcome = _outcome(scene, assembly, problem, report, relations, entries, residuals)
     if options.check_lens:
-        lens = unmodelled_distortion(problem, options.threads)
+        lens = unmodelled_distortion(problem, options.threads, residuals=residuals)
         found = lens and lens.sentence, rig_that_does_not_fit(scene, problem, options.threads)
         outcome = replace(outcome, warnings=(*outcome.warnings, *filter(None, found)))
     _log(outcome)
@@ -271,9 +276,11 @@ def _outcome(
     report: SolveReport,
     relations: dict[str, dict[str, int]],
     stages: tuple[dict[str, Any], ...],
+    residuals: Residuals,
 ) -> AdjustReport:
     """Say in numbers what an adjustment did: from the problem of the assembly to the one that was solved."""
-    before, after = (squared_residuals_px(replace(assembly, problem=p)) for p in (assembly.problem, problem))
+    now, redundancy = replace(assembly, problem=problem), redundancy_of(assembly)
+    before, after = squared_residuals_px(assembly), squared_residuals_px(now, residuals=residuals)
     counts, start = assembly.num_measurements, assembly.problem.variables
     return AdjustReport(
         num_images=scene.num_images,
@@ -283,8 +290,8 @@ def _outcome(
         num_observations=sum(len(group.factor) for group in assembly.groups if group.observes),
         num_measurements={name: count for name, count in counts.items() if name not in COUNTED_OTHERWISE},
         rmse_px={kind: {"before": _rms(before[kind]), "after": _rms(after[kind])} for kind in before},
-        inliers=inliers(before, after, redundancy_of(assembly)),
-        sigma0=_sigma0(replace(assembly, problem=problem)),
+        inliers=inliers(before, after, redundancy),
+        sigma0=_sigma0(squared_residuals_px(now, weighted=True, residuals=residuals), redundancy),
         solve=report,
         relations=relations,
         stages=stages,
@@ -378,9 +385,8 @@ def _rms(squares: FloatArray) -> float:
     return float(np.sqrt(np.mean(squares)))
 
 
-def _sigma0(assembly: Assembly) -> float | None:
+def _sigma0(squares: dict[str, FloatArray], redundancy: dict[str, FloatArray]) -> float | None:
     """Return the noise that the observations show, in units of the noise that was stated."""
-    squares, redundancy = squared_residuals_px(assembly, weighted=True), redundancy_of(assembly)
     joined = [
         np.concatenate([part[kind] for kind in squares]) if squares else np.zeros(0) for part in (squares, redundancy)
     ]

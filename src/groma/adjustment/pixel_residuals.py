@@ -7,10 +7,12 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import Assembly
-from groma.problem.residuals import residuals_of
+from groma.problem.residuals import Residuals
 
 
-def squared_residuals_px(assembly: Assembly, weighted: bool = False) -> dict[str, FloatArray]:
+def squared_residuals_px(
+    assembly: Assembly, weighted: bool = False, residuals: Residuals | None = None
+) -> dict[str, FloatArray]:
     """Return the squared norm of every reprojection residual by kind of landmark.
 
     A point has one residual of two coordinates, a segment one of the distances of its two ends.
@@ -21,6 +23,8 @@ def squared_residuals_px(assembly: Assembly, weighted: bool = False) -> dict[str
         A problem made from a scene, at any state.
     weighted : bool
         In standard deviations instead of pixels; of segments then at the places where they were measured.
+    residuals : Residuals, optional
+        Those of the problem, where they are needed elsewhere too.
 
     Returns
     -------
@@ -28,19 +32,24 @@ def squared_residuals_px(assembly: Assembly, weighted: bool = False) -> dict[str
         For ``points`` and ``lines``, if there are: (N,) float64, pixels squared, or variances.
     """
     parts: dict[str, list[FloatArray]] = {}
-    problem = assembly.problem
+    problem, residuals = assembly.problem, residuals or Residuals(assembly.problem)
     for group, factor in zip(assembly.groups, problem.factors, strict=True):
         if not group.observes or len(factor) == 0:
             continue
-        residual = residuals_of(factor, problem.variables)
+        residual = residuals.of(factor)
         unit = np.asarray(factor.sqrt_information if weighted else _or_1(group.pixels_of_residual))
         if unit.ndim == 3:
             residual, unit = np.einsum("nij,nj->ni", unit, residual), np.ones(1)
         if group.observes == "lines" and not weighted:
             residual = at_ends(residual, assembly.reach)
-        residual = residual[:, :2]  # of a stereo pair the left image
-        parts.setdefault(group.observes, []).append(np.einsum("ni,ni->n", residual, residual) * unit**2)
+        parts.setdefault(group.observes, []).append(squared_length(residual) * unit**2)
     return {kind: np.concatenate(squares) for kind, squares in parts.items()}
+
+
+def squared_length(residual: FloatArray) -> FloatArray:
+    """Return the squared norms (N,) of the first two coordinates of residuals; of a stereo pair the left image."""
+    x, y = residual[:, 0], residual[:, 1]
+    return x * x + y * y
 
 
 #: Unknowns of a landmark by kind.
@@ -72,5 +81,5 @@ def _or_1(pixels: FloatArray | None) -> FloatArray:
 
 def at_ends(residual: FloatArray, reach: float) -> FloatArray:
     """Distances (N, 2) of a segment's ends from distances at two places, so far from its middle in half lengths."""
-    middle, turn = residual.mean(axis=1), 0.5 * (residual[:, 1] - residual[:, 0]) / reach
+    middle, turn = 0.5 * (residual[:, 0] + residual[:, 1]), 0.5 * (residual[:, 1] - residual[:, 0]) / reach
     return np.stack([middle - turn, middle + turn], axis=1)

@@ -58,8 +58,8 @@ class Draft:
 
     Parameters
     ----------
-    problem, factor
-        The group, and the problem with its variables.
+    problem, number
+        The problem with its variables, and the number of the group among its factors.
     landmarks
         The groups of variables that are eliminated.
     member_of, kept
@@ -69,12 +69,12 @@ class Draft:
     def __init__(
         self,
         problem: Problem,
-        factor: Factor,
+        number: int,
         landmarks: tuple[str, ...],
         member_of: Mapping[str, tuple[int, int]],
         kept: tuple[KeptClass, ...],
     ) -> None:
-        self.factor = factor
+        self.factor, self.number = problem.factors[number], number
         self.kept = kept
         #: Class, block of each factor and first column of each kept block.
         self.entries: list[tuple[int, IntArray, int]] = []
@@ -189,4 +189,5 @@ class Draft:
             eliminated=None if self.landmark_group is None else landmarks.index(self.landmark_group),
             landmark_column=self.landmark_column,
             landmark=self.landmark,
+            number=self.number,
         )

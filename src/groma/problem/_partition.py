@@ -102,7 +102,8 @@ def _private_intrinsics(problem: Problem, group: str, kept: list[str]) -> tuple[
     block_of = np.full(count, -1, np.int32)
     for index, pose in uses:
         block_of[index] = pose
-    if any((block_of.take(index) != pose).any() for index, pose in uses):
+    one_to_one = all(np.array_equal(index, pose) for index, pose in uses)
+    if not one_to_one and any((block_of.take(index) != pose).any() for index, pose in uses):
         return None
     return (partner, block_of) if (np.sort(block_of) == np.arange(count)).all() else None
 

@@ -3,6 +3,9 @@
 
 The steps of :func:`lay_out`, in order: choose the landmarks, form classes of kept blocks, draft the records of every
 factor group, sort landmarks and factors, number the blocks of the reduced system, and cut the work into chunks.
+
+States and losses have no part in it. Where the same problem is solved from other states or under another loss,
+:class:`Layouts` keeps what was found.
 """
 
 from __future__ import annotations
@@ -15,17 +18,20 @@ from groma._typing import IntArray
 from groma.problem._draft import Draft
 from groma.problem._partition import choose_landmarks, kept_classes
 from groma.problem.layout import (
+    CHUNK_SIZE,
     Chunk,
     Eliminated,
     FactorLayout,
     Incidences,
     Layout,
 )
-from groma.problem.problem import Problem
+from groma.problem.problem import Problem, under_loss
 from groma.problem.sorting import PairTable, argsort_by, distinct_pairs, first_and_last
+from groma.problem.tied import Divided, with_tied_apart
 
-#: Factors per chunk: their records (a few hundred bytes each) should fit the second-level cache (cost: time alone).
-CHUNK_SIZE = 4096
+#: Factors per chunk where no variable shares a factor with another: what has converged is left alone, chunk by chunk.
+#: Those that follow each other are done together (cost: time alone).
+CHUNK_ALONE = 512
 
 
 def lay_out(problem: Problem, eliminate: str | tuple[str, ...] = "auto", chunk_size: int = CHUNK_SIZE) -> Layout:
@@ -37,7 +43,7 @@ def lay_out(problem: Problem, eliminate: str | tuple[str, ...] = "auto", chunk_s
     for c, kept_class in enumerate(kept):
         diagonal = np.arange(kept_class.count, dtype=np.int32)
         tables[c, c].add_list(diagonal, diagonal)
-    drafts = [Draft(problem, factor, landmarks, member_of, kept) for factor in problem.factors if len(factor)]
+    drafts = [Draft(problem, n, landmarks, member_of, kept) for n, factor in enumerate(problem.factors) if len(factor)]
     drafts = [draft for draft in drafts if draft.is_free]
     orders = {group: _landmark_order(problem, group, drafts, kept) for group in landmarks}
     for draft in drafts:
@@ -48,10 +54,60 @@ def lay_out(problem: Problem, eliminate: str | tuple[str, ...] = "auto", chunk_s
     for e, group in enumerate(landmarks):
         eliminated.append(_incidences(problem, group, e, orders[group][0], layouts, kept, tables))
     blocks = {pair: table.pairs() for pair, table in tables.items() if table.count}
-    chunks = _chunks(layouts, eliminated, chunk_size)
+    chunks = _chunks(layouts, eliminated, chunk_size if kept else min(chunk_size, CHUNK_ALONE))
     return Layout(
         problem, kept, tuple(eliminated), tuple(layouts), chunks, blocks, {p: num_direct[p] for p in blocks}, warnings
     )
+
+
+class Layouts:
+    """The last layout, for problems that are solved again at other states or under other losses."""
+
+    def __init__(self) -> None:
+        self._last: tuple[Divided, Layout, str | tuple[str, ...]] | None = None
+
+    def of(self, problem: Problem, eliminate: str | tuple[str, ...]) -> tuple[Divided, Layout]:
+        """Return the problem with its tied landmarks apart, and the layout of that."""
+        if self._last is not None:
+            parts, layout, as_before = self._last
+            if not parts.tied and eliminate == as_before and problem.has_structure_of(layout.problem):
+                self._last = Divided(problem, ()), _of_problem(layout, problem), eliminate
+                return self._last[:2]
+        self._last = None  # its memory is free for the next one
+        parts = with_tied_apart(problem, eliminate)
+        self._last = parts, lay_out(parts.problem, eliminate), eliminate
+        return self._last[:2]
+
+
+def lay_out_landmarks(layout: Layout, groups: tuple[str, ...]) -> Layout:
+    """Return the layout of the same problem in which only these groups move: each of their landmarks on its own."""
+    if groups not in layout.of_landmarks:
+        problem = layout.problem
+        held = {
+            name: group if name in groups else dataclasses.replace(group, constant=True)
+            for name, group in problem.variables.items()
+        }
+        numbers = tuple(
+            number
+            for number, factor in enumerate(problem.factors)
+            if any(ref.group in groups for _, ref in factor.references())
+        )
+        alone = Problem(held, [problem.factors[number] for number in numbers])
+        layout.of_landmarks[groups] = lay_out(alone, groups), numbers
+    return layout.of_landmarks[groups][0]
+
+
+def _of_problem(layout: Layout, problem: Problem) -> Layout:
+    """Return a layout for a problem of the same structure."""
+    factors = tuple(
+        dataclasses.replace(one, factor=under_loss(one.factor, problem.factors[one.number].loss))
+        for one in layout.factors
+    )
+    of_landmarks = {}
+    for groups, (inner, numbers) in layout.of_landmarks.items():
+        alone = inner.problem.with_losses([problem.factors[number].loss for number in numbers])
+        of_landmarks[groups] = _of_problem(inner, alone), numbers
+    return dataclasses.replace(layout, problem=problem, factors=factors, of_landmarks=of_landmarks)
 
 
 def _landmark_order(problem, group: str, drafts: list[Draft], kept) -> tuple[IntArray, IntArray]:
@@ -116,13 +172,20 @@ def _incidences(problem, group, e, order, layouts: list[FactorLayout], kept, tab
     return Eliminated(group, problem.variables[group].manifold.dof, count, order, incidences, cross)
 
 
+def _starts(landmark: IntArray, count: int) -> IntArray:
+    """Return where the factors of each landmark begin, (count + 1,), for landmarks in ascending order."""
+    starts = np.zeros(count + 1, np.int64)
+    np.cumsum(np.bincount(landmark, minlength=count), out=starts[1:])
+    return starts
+
+
 def _chunks(layouts: list[FactorLayout], eliminated: list[Eliminated], chunk_size: int) -> tuple[Chunk, ...]:
     """Cut the work into chunks of about ``chunk_size`` factors."""
     chunks = []
     for e, group in enumerate(eliminated):
         mine = [f for f, layout in enumerate(layouts) if layout.eliminated == e]
-        starts = [np.searchsorted(layouts[f].landmark, np.arange(group.count + 1)) for f in mine]
-        total = np.sum([np.zeros(group.count + 1, np.int64), *starts], axis=0)
+        starts = [_starts(layouts[f].landmark, group.count) for f in mine]
+        total = sum(starts, np.zeros(group.count + 1, np.int64))
         begin = 0
         while begin < group.count:
             end = int(np.searchsorted(total, total[begin] + chunk_size, side="right")) - 1

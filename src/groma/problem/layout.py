@@ -18,6 +18,7 @@ landmarks touches few kept blocks and all it needs stays in cache. A chunk is th
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,6 +26,9 @@ import numpy as np
 from groma._typing import IntArray
 from groma.factors.contract import Factor
 from groma.problem.problem import Problem
+
+#: Factors per chunk: their records (a few hundred bytes each) should fit the second-level cache (cost: time alone).
+CHUNK_SIZE = 4096
 
 
 @dataclass(frozen=True)
@@ -126,6 +130,8 @@ class FactorLayout:
     landmark_column: int = -1
     #: (N,) position of each factor's landmark; empty if there is none.
     landmark: IntArray = field(default_factory=lambda: np.zeros(0, np.int32))
+    #: Its number among the groups of the problem.
+    number: int = -1
 
 
 @dataclass(frozen=True)
@@ -138,6 +144,13 @@ class Chunk:
     #: (factor layout, begin, end).
     factors: tuple[tuple[int, int, int], ...]
     size: int
+
+    def up_to(self, last: Chunk) -> Chunk:
+        """Return this chunk and those that follow it, up to ``last``, as one; all have landmarks of the same group."""
+        if last is self:
+            return self
+        factors = tuple((f, begin, end) for (f, begin, _), (_, _, end) in zip(self.factors, last.factors, strict=True))
+        return Chunk(self.eliminated, self.begin, last.end, factors, sum(end - begin for _, begin, end in factors))
 
 
 @dataclass
@@ -154,8 +167,25 @@ class Layout:
     blocks: dict[tuple[int, int], tuple[IntArray, IntArray]]
     num_direct: dict[tuple[int, int], int]
     warnings: list[str] = field(default_factory=list)
+    #: Layouts in which some groups of landmarks move alone, found so far, and the groups of factors that they have.
+    of_landmarks: dict[tuple[str, ...], tuple[Layout, tuple[int, ...]]] = field(default_factory=dict)
 
     @property
     def num_kept_unknowns(self) -> int:
         """Size of the reduced system."""
         return sum(c.width * c.count for c in self.kept)
+
+
+def in_runs(chunks: Iterable[Chunk], most: int) -> Iterator[list[Chunk]]:
+    """Yield chunks of landmarks that follow each other together, up to ``most`` factors; others one by one."""
+    run: list[Chunk] = []
+    size = 0
+    for chunk in chunks:
+        fits = size + chunk.size <= most and chunk.eliminated is not None
+        if run and not (fits and (run[-1].eliminated, run[-1].end) == (chunk.eliminated, chunk.begin)):
+            yield run
+            run, size = [], 0
+        run.append(chunk)
+        size += chunk.size
+    if run:
+        yield run

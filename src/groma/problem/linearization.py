@@ -20,8 +20,9 @@ import numpy as np
 from groma._simd import width
 from groma._typing import FloatArray
 from groma.problem._records import chain_rule, cost_scaled, cost_whitened, mask, weigh, whiten
+from groma.problem._room import room_for_chunks, room_for_sums
 from groma.problem._sums import add_block, add_cross, add_incidence, add_primary
-from groma.problem.layout import Chunk, FactorLayout, Layout
+from groma.problem.layout import CHUNK_SIZE, Chunk, FactorLayout, Layout, in_runs
 from groma.problem.parallel import Workers, shares_of, sum_of
 
 States = Mapping[str, FloatArray]
@@ -68,6 +69,10 @@ class NormalEquations:
         for chunk in layout.chunks:
             for f, begin, end in chunk.factors:
                 self._sizes[f] = max(self._sizes[f], end - begin)
+        if not layout.kept:
+            self._sizes = [
+                max(n, min(CHUNK_SIZE, len(f.factor))) for n, f in zip(self._sizes, layout.factors, strict=True)
+            ]
         self.shares = shares_of(layout)
         self._scratch = threading.local()  # one per thread, not per share: it stays in cache
         self._references = [tuple(ref for _, ref in factor.factor.references()) for factor in layout.factors]
@@ -78,17 +83,9 @@ class NormalEquations:
             if free is not None:
                 order = next((e.order for e in layout.eliminated if e.group == name), None)
                 self._free[name] = np.ascontiguousarray(free if order is None else free[order])
-        self.V = [np.zeros(e.count * e.dof * e.dof) for e in layout.eliminated]
-        self.g_landmarks = [np.zeros(e.count * e.dof) for e in layout.eliminated]
-        self.W = [
-            {
-                c: np.zeros(len(i.block) * e.dof * layout.kept[c].width, np.float32 if compact else np.float64)
-                for c, i in e.incidences.items()
-            }
-            for e in layout.eliminated
-        ]
+        self.V, self.g_landmarks, self.W = room_for_sums(layout, compact)
         self._chunk_W: list[list[dict[int, Any]]] = [
-            self._room_for_chunks() if compact else self.W for _ in self.shares
+            room_for_chunks(layout) if compact else self.W for _ in self.shares
         ]
         self._alone = [
             {c: _has_one_source(layout, number, c) for c in e.incidences} for number, e in enumerate(layout.eliminated)
@@ -159,13 +156,15 @@ class NormalEquations:
     def _runs(self, share: int, wanted: Callable[[Chunk], bool] | None) -> Iterator[tuple[int, int, int]]:
         """Yield factor group, begin and end of factors of many chunks: costs need less room than records."""
         runs: dict[int, tuple[int, int]] = {}
+        room = [len(self._record(f)) // (one.factor.residual_size + 1) for f, one in enumerate(self.layout.factors)]
         for chunk in self.shares[share]:
             if wanted is not None and not wanted(chunk):
                 continue
-            for f, begin, end in (piece for piece in chunk.factors if piece[1] < piece[2]):
+            for f, begin, end in chunk.factors:
+                if begin == end:
+                    continue
                 first, last = runs.get(f, (begin, begin))
-                size = self.layout.factors[f].factor.residual_size
-                if last != begin or (end - first) * (size + 1) > len(self._record(f)):
+                if last != begin or end - first > room[f]:
                     yield f, first, last
                     first = begin
                 runs[f] = first, end
@@ -228,9 +227,9 @@ class NormalEquations:
                 H[:] = 0.0
             for g in self._g[share]:
                 g[:] = 0.0
-            for chunk in self.shares[share]:
-                if wanted is not None and not wanted(chunk):
-                    continue
+            chosen = (chunk for chunk in self.shares[share] if wanted is None or wanted(chunk))
+            for chunks in in_runs(chosen, 0 if self.layout.kept else CHUNK_SIZE):
+                chunk = chunks[0].up_to(chunks[-1])
                 self._clear(share, chunk)
                 for f, begin, end in chunk.factors:
                     if begin < end:
@@ -238,7 +237,8 @@ class NormalEquations:
                         costs[f] += cost
                         degenerate[f] += count
                 if after_chunk is not None and chunk.eliminated is not None:
-                    after_chunk(share, chunk)
+                    for part in chunks:
+                        after_chunk(share, part)
                 if self.compact and chunk.eliminated is not None:
                     self._round(share, chunk)
             return costs, degenerate
@@ -263,21 +263,6 @@ class NormalEquations:
             begin, end = incidences.pointer[chunk.begin], incidences.pointer[chunk.end]
             W, first = self.blocks_of_chunk(share, chunk, c)
             W[(begin - first) * size : (end - first) * size] = 0.0
-
-    def _room_for_chunks(self) -> list[dict[int, Any]]:
-        """Room for the part of W of any one chunk."""
-        room = []
-        for e, group in enumerate(self.layout.eliminated):
-            most = {
-                c: max(
-                    i.pointer[chunk.end] - i.pointer[chunk.begin]
-                    for chunk in self.layout.chunks
-                    if chunk.eliminated == e
-                )
-                for c, i in group.incidences.items()
-            }
-            room.append({c: np.zeros(n * group.dof * self.layout.kept[c].width) for c, n in most.items()})
-        return room
 
     def blocks_of_chunk(self, share: int, chunk: Chunk, kept_class: int) -> tuple[FloatArray, int]:
         """Return an array with the blocks W of a chunk, in double precision, and the incidence it begins with."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -78,8 +78,18 @@ class Problem:
     def with_losses(self, losses: Sequence[Loss]) -> Problem:
         """Return the same problem with other losses, one for each group of factors."""
         other = copy.copy(self)  # a loss has no part in what was checked
-        object.__setattr__(other, "factors", tuple(map(_under, self.factors, losses)))
+        object.__setattr__(other, "factors", tuple(map(under_loss, self.factors, losses)))
         return other
+
+    def has_structure_of(self, other: Problem) -> bool:
+        """Whether another problem differs in nothing but states and losses, as those made from one another do."""
+        groups, others = self.variables, other.variables
+        return (
+            list(groups) == list(others)
+            and all(_moves_alike(group, others[name]) for name, group in groups.items())
+            and len(self.factors) == len(other.factors)
+            and all(map(_differ_by_loss, self.factors, other.factors))
+        )
 
     @property
     def num_residuals(self) -> int:
@@ -87,9 +97,21 @@ class Problem:
         return sum(len(factor) * factor.residual_rank for factor in self.factors)
 
 
-def _under(factor: Factor, loss: Loss) -> Factor:
+def under_loss(factor: Factor, loss: Loss) -> Factor:
+    """Return a group of factors with another loss; the rest of it is the same objects."""
     if factor.loss == loss:
         return factor
     other = copy.copy(factor)
     object.__setattr__(other, "loss", loss)
     return other
+
+
+def _moves_alike(group: Variables, other: Variables) -> bool:
+    return len(group) == len(other) and group.manifold is other.manifold and group.constant is other.constant
+
+
+def _differ_by_loss(factor: Factor, other: Factor) -> bool:
+    if type(factor) is not type(other):
+        return False
+    names = (field.name for field in fields(factor) if field.name != "loss")
+    return all(getattr(factor, name) is getattr(other, name) for name in names)

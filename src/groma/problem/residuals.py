@@ -9,6 +9,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.factors.contract import Factor
+from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 
 
@@ -22,6 +23,20 @@ def residuals_of(factor: Factor, variables: Mapping[str, Variables]) -> FloatArr
         ambients = tuple(variables[ref.group].ambient() for _, ref in factor.references())
         factor.residuals(factor.prepare(ambients), 0, len(factor), residuals)
     return residuals
+
+
+class Residuals:
+    """Residuals of the factors of a problem at its states; each group of factors is evaluated once."""
+
+    def __init__(self, problem: Problem) -> None:
+        self._problem = problem
+        self._found: dict[int, FloatArray] = {}
+
+    def of(self, factor: Factor) -> FloatArray:
+        """Return :func:`residuals_of` one of the problem's own groups of factors."""
+        if id(factor) not in self._found:
+            self._found[id(factor)] = residuals_of(factor, self._problem.variables)
+        return self._found[id(factor)]
 
 
 def jacobians_of(factor: Factor, variables: Mapping[str, Variables]) -> dict[str, FloatArray]:
@@ -71,4 +86,4 @@ def squared_norms(factor: Factor, variables: Mapping[str, Variables]) -> FloatAr
     return np.einsum("ni,ni->n", residuals, residuals) * information**2
 
 
-__all__ = ["jacobians_of", "residuals_of", "squared_norms"]
+__all__ = ["Residuals", "jacobians_of", "residuals_of", "squared_norms"]

@@ -8,6 +8,7 @@ once it has converged: what it becomes does not depend on the others, and a few 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,7 +24,7 @@ from groma.solver.damped_problem import Trial
 from groma.solver.linear.schur import MIN_DIAGONAL, invert_blocks
 from groma.solver.options import SolverOptions, first_damping
 from groma.solver.report import SolveReport, Stopwatch, note_costs
-from groma.solver.steps import States, landmark_slopes
+from groma.solver.steps import States
 from groma.solver.termination import Termination
 
 #: A variable whose damping exceeds this has reached its minimum to machine precision.
@@ -85,7 +86,12 @@ class IndependentBlocks:
         self._h = [np.zeros_like(g) for g in self.equations.g_landmarks]
         self._initial_damping = initial_damping
         self._max_damping = MAX_DAMPING if initial_damping > 0.0 else 0.0
+        self._begins = [
+            np.array([chunk.begin for chunk in layout.chunks if chunk.eliminated == e], dtype=np.int64)
+            for e in range(len(layout.eliminated))
+        ]
         self._singular: dict[tuple[int, int], int] = {}
+        self._steepest: dict[tuple[int, int], float] = {}
         self.reset()
 
     @property
@@ -100,14 +106,18 @@ class IndependentBlocks:
         self.damping = [np.full(e.count, self._initial_damping) for e in self.layout.eliminated]
         self._growth = [np.full(e.count, 2.0) for e in self.layout.eliminated]
 
-    def _wanted(self, chunk: Chunk) -> bool:
-        """Whether some variable of a chunk has not converged."""
-        return chunk.eliminated is not None and bool(self._unfinished[chunk.eliminated][chunk.begin : chunk.end].any())
+    def _with_any(self, variables: list[BoolArray]) -> Callable[[Chunk], bool]:
+        """Return what tells whether a chunk has any of these variables of each group."""
+        found = [np.logical_or.reduceat(mine, begin) for mine, begin in zip(variables, self._begins, strict=True)]
+        those = {(e, at) for e, any_of in enumerate(found) for at in self._begins[e][any_of].tolist()}
+        return lambda chunk: (chunk.eliminated, chunk.begin) in those
 
     def costs(self, states: States, known: list[FloatArray] | None = None) -> list[FloatArray]:
         """Return the cost of each variable of each group; where it has converged, that of ``known`` if given."""
         costs = [np.zeros(e.count) for e in self.layout.eliminated]
-        self.equations.cost(self.equations.prepare(states), costs, None if known is None else self._wanted)
+        self.equations.cost(
+            self.equations.prepare(states), costs, None if known is None else self._with_any(self._unfinished)
+        )
         if known is not None:
             costs = [np.where(mine, new, old) for mine, new, old in zip(self._unfinished, costs, known, strict=True)]
         return costs
@@ -120,12 +130,13 @@ class IndependentBlocks:
     def linearize(self, states: States) -> None:
         """Form and solve the normal equations of all variables that have not converged."""
         prepared = self.equations.prepare(states)
-        self.equations.linearize(states, prepared, self._invert, self._wanted if self._begun else None)
+        wanted = self._with_any(self._unfinished) if self._begun else None
+        self.equations.linearize(states, prepared, self._invert, wanted)
         self._begun = True
 
     def largest_gradient(self) -> float:
         """Return the largest component of the gradient, each over the root of its curvature."""
-        return max(landmark_slopes(self.equations), default=0.0)
+        return float(np.sqrt(np.max([*self._steepest.values()], initial=0.0)))
 
     def advance(self, states: States, costs: list[FloatArray]) -> tuple[States, list[FloatArray], BlockProgress]:
         """Take the step of every variable from where they were linearised, if it lowers the variable's cost."""
@@ -179,7 +190,7 @@ class IndependentBlocks:
         if e is not None:
             V, g = self.equations.V[e], self.equations.g_landmarks[e]
             dof = width(self.layout.eliminated[e].dof)
-            self._singular[e, chunk.begin] = invert_blocks(
+            self._singular[e, chunk.begin], self._steepest[e, chunk.begin] = invert_blocks(
                 V, g, self.damping[e], 1, chunk.begin, chunk.end, self._N[e], self._h[e], dof
             )
 
@@ -198,17 +209,14 @@ class IndependentBlocks:
             wrong = counts & ((ratio > STRETCH.longer) | (ratio < STRETCH.shorter))
             factors.append(np.where(wrong, stretch_factor(ratio), 1.0))
 
-        def concerned(chunk: Chunk) -> bool:
-            e = chunk.eliminated
-            return e is not None and bool((factors[e][chunk.begin : chunk.end] != 1.0).any())
-
-        if all((factor == 1.0).all() for factor in factors):
+        tried = [factor != 1.0 for factor in factors]
+        if not any(map(np.any, tried)):
             return
         other = self._moved(states, [factor[:, None] * delta for factor, delta in zip(factors, deltas, strict=True)])
         other_costs = [np.zeros(e.count) for e in self.layout.eliminated]
-        self.equations.cost(self.equations.prepare(other), other_costs, concerned)
+        self.equations.cost(self.equations.prepare(other), other_costs, self._with_any(tried))
         for e, group in enumerate(self.layout.eliminated):
-            better = (factors[e] != 1.0) & (other_costs[e] < new_costs[e])
+            better = tried[e] & (other_costs[e] < new_costs[e])
             moved[group.group] = np.where(better[:, None], other[group.group], moved[group.group])
             deltas[e] = np.where(better[:, None], factors[e][:, None] * deltas[e], deltas[e])
             new_costs[e] = np.where(better, other_costs[e], new_costs[e])

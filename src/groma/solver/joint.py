@@ -17,7 +17,7 @@ from groma.solver.linear.schur import ReducedSystem
 from groma.solver.options import SolverOptions, first_damping
 from groma.solver.refinement import landmark_refiner
 from groma.solver.report import SolveReport, Stopwatch, note_costs
-from groma.solver.steps import States, Step, landmark_slopes, largest_slope, relative_length, retract, sizes_of
+from groma.solver.steps import States, Step, largest_slope, relative_length, retract, sizes_of
 from groma.solver.termination import Termination
 from groma.solver.trial import JointTrial, evaluated
 
@@ -74,7 +74,7 @@ class JointProblem:
     def largest_gradient(self) -> float:  # noqa: D102
         equations, kept = self.equations, range(len(self._layout.kept))
         slopes = [largest_slope(equations.g_kept[c], self._system.diagonal(c).reshape(-1)) for c in kept]
-        return max([*slopes, *landmark_slopes(equations)], default=0.0)
+        return max([*slopes, self._system.largest_landmark_slope()])
 
     def is_curved(self) -> bool:  # noqa: D102
         kept = (self._system.diagonal(c) for c in range(len(self._layout.kept)))

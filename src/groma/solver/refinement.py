@@ -7,11 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from groma.problem.lay_out import lay_out
+from groma.problem.lay_out import lay_out_landmarks
 from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations, to_original_order
 from groma.problem.parallel import Workers
-from groma.problem.problem import Problem
 from groma.solver.independent import IndependentBlocks
 from groma.solver.options import SolverOptions
 from groma.solver.steps import States
@@ -26,14 +25,9 @@ class LandmarkRefiner:
     """
 
     def __init__(self, layout: Layout, workers: Workers, groups: list[str], steps: int) -> None:
-        held = {
-            name: group if name in groups else replace(group, constant=True)
-            for name, group in layout.problem.variables.items()
-        }
-        factors = [f for f in layout.problem.factors if any(ref.group in groups for _, ref in f.references())]
         self._outer, self._groups, self._steps, self._workers = layout, groups, steps, workers
         self._of_all: LandmarkRefiner | None = None
-        self._blocks = IndependentBlocks(lay_out(Problem(held, factors), tuple(groups)), workers, 1e-6)
+        self._blocks = IndependentBlocks(lay_out_landmarks(layout, tuple(groups)), workers, 1e-6)
 
     def refine(self, equations: NormalEquations, trial: JointTrial, instead: States | None = None) -> JointTrial:
         """Return the trial with better landmarks.

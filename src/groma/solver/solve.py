@@ -25,12 +25,11 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.errors import check_kind
 from groma.execution import available_cores
-from groma.problem.lay_out import lay_out
+from groma.problem.lay_out import Layouts
 from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations, to_original_order, to_solver_order
 from groma.problem.parallel import FACTORS_FOR_THREADS, Workers
 from groma.problem.problem import Problem
-from groma.problem.tied import with_tied_apart
 from groma.solver.damped_problem import DampedProblem, T
 from groma.solver.independent import STRETCH, IndependentProblem, stretch_factor
 from groma.solver.joint import JointProblem
@@ -57,7 +56,12 @@ class Solution:
         return self.problem.variables[group].state
 
 
-def solve(problem: Problem, options: SolverOptions | None = None, progress: Progress | None = None) -> Solution:
+def solve(
+    problem: Problem,
+    options: SolverOptions | None = None,
+    progress: Progress | None = None,
+    layouts: Layouts | None = None,
+) -> Solution:
     r"""Minimise :math:`\tfrac12 \sum \rho(\lVert r \rVert^2)` over the free variables of a problem.
 
     Parameters
@@ -68,6 +72,9 @@ def solve(problem: Problem, options: SolverOptions | None = None, progress: Prog
         How to solve; the defaults suit bundle adjustment.
     progress
         Called with an :class:`Iteration` after every step tried; return False to stop.
+    layouts
+        For one solve after the other of the same problem, at other states or under other losses: what is common to
+        them is found once.
 
     Returns
     -------
@@ -84,8 +91,7 @@ def solve(problem: Problem, options: SolverOptions | None = None, progress: Prog
     report = SolveReport(num_factors=sum(map(len, problem.factors)), num_residuals=problem.num_residuals)
     watch = Stopwatch(report)
     with watch("setup"):
-        parts = with_tied_apart(problem, options.eliminate)
-        layout = lay_out(parts.problem, options.eliminate)
+        parts, layout = (layouts or Layouts()).of(problem, options.eliminate)
     report.notes += layout.warnings
     report.num_unknowns = count_unknowns(problem)
     if not layout.factors:

@@ -11,7 +11,6 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.geometry.manifold import Manifold
 from groma.problem.layout import Layout
-from groma.problem.linearization import NormalEquations
 
 States = dict[str, FloatArray]
 #: About so many states of a group are looked at for the one of middle length (Cost: time only).
@@ -55,13 +54,12 @@ def squares_of_step(manifold: Manifold, delta: FloatArray) -> FloatArray:
 
     They are compared with the states one by one, so that the unit of length does not decide which of them count.
     """
-    squares = np.einsum("ij,ij->j", delta, delta)
-    total = float(squares.sum())
-    if manifold.kind == "point":
-        return np.array([total, 0.0, 0.0])
     if manifold.kind == "pose":
+        squares = np.einsum("ij,ij->j", delta, delta)
         return np.array([float(squares[:3].sum()), float(squares[3:].sum()), 0.0])
-    return np.array([0.0, 0.0, total])
+    flat = delta.reshape(-1)
+    total = float(flat @ flat)
+    return np.array([total, 0.0, 0.0] if manifold.kind == "point" else [0.0, 0.0, total])
 
 
 def squares_of_states(manifold: Manifold, state: FloatArray) -> FloatArray:
@@ -126,12 +124,3 @@ def largest_slope(gradient: FloatArray, curvature: FloatArray) -> float:
     """
     roots = np.sqrt(np.maximum(curvature, np.finfo(float).tiny))
     return float(np.max(np.abs(gradient) / roots, initial=0.0))
-
-
-def landmark_slopes(equations: NormalEquations) -> list[float]:
-    """Return :func:`largest_slope` of each group of landmarks."""
-    slopes = []
-    for group, V, gradient in zip(equations.layout.eliminated, equations.V, equations.g_landmarks, strict=True):
-        curvature = V.reshape(group.count, group.dof**2)[:, :: group.dof + 1]
-        slopes.append(largest_slope(gradient.reshape(group.count, group.dof), curvature))
-    return slopes

@@ -21,8 +21,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from groma._typing import BoolArray, FloatArray, IntArray
+from groma._typing import FloatArray, IntArray
 from groma.adjustment.fit import FIT, noise_of
+from groma.adjustment.pixel_residuals import squared_length
 from groma.cameras import CameraModel, in_model
 from groma.cameras import model as camera_model
 from groma.factors.contract import Factor, Ref
@@ -30,7 +31,7 @@ from groma.factors.observations.point_reprojection import PointReprojection
 from groma.gates import chi_square_gate, gate
 from groma.geometry.manifold import Euclidean
 from groma.problem.problem import Problem
-from groma.problem.residuals import residuals_of
+from groma.problem.residuals import Residuals, residuals_of
 from groma.problem.variables import Variables
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
@@ -84,7 +85,11 @@ class Lens:
 
 
 def unmodelled_distortion(
-    problem: Problem, threads: int | None = None, gates: LensGates = LENS, wider: Mapping[str, str] = WIDER
+    problem: Problem,
+    threads: int | None = None,
+    gates: LensGates = LENS,
+    wider: Mapping[str, str] = WIDER,
+    residuals: Residuals | None = None,
 ) -> Lens | None:
     """Return the distortion that the cameras of an adjusted problem lack; None where there is none.
 
@@ -98,6 +103,8 @@ def unmodelled_distortion(
         What counts.
     wider : mapping
         The model that a camera may lack, by the model that it has.
+    residuals : Residuals, optional
+        Those of the problem, where they are needed elsewhere too.
     """
     groups = {f.intrinsics.group: f.camera for f in problem.factors if isinstance(f, PointReprojection) and len(f)}
     groups = {
@@ -106,7 +113,8 @@ def unmodelled_distortion(
         if model.name in wider and _may_lack(problem.variables[name], model, wider[model.name])
     }
     seen = [f for f in problem.factors if isinstance(f, PointReprojection) and f.intrinsics.group in groups]
-    if not any(radial_field(f, problem, gates) for f in seen):
+    residuals = residuals or Residuals(problem)
+    if not any(radial_field(f, problem, residuals.of(f), gates) for f in seen):
         return None
     options = SolverOptions(max_iterations=gates.max_iterations, threads=threads)
     begun = of_points(problem, gates.max_observations)
@@ -120,34 +128,37 @@ def unmodelled_distortion(
     return Lens(tuple(models), tuple(sorted({model.name for model in groups.values()})), before, after)
 
 
-def radial_field(factor: PointReprojection, problem: Problem, gates: LensGates = LENS) -> bool:
-    """Whether the residuals of points along the radius are not those of noise alone; see the formula above."""
-    model, residual = factor.camera, residuals_of(factor, problem.variables)
-    params = problem.variables[factor.intrinsics.group].state
+def radial_field(
+    factor: PointReprojection, problem: Problem, residual: FloatArray | None = None, gates: LensGates = LENS
+) -> bool:
+    """Whether the ``residual`` of points along the radius is not that of noise alone; see the formula above."""
+    model, params = factor.camera, problem.variables[factor.intrinsics.group].state
+    residual = residuals_of(factor, problem.variables) if residual is None else residual
     center = (
         params[:, list(model.principal_point_indices)] if model.principal_point_indices else np.zeros((len(params), 2))
     )
-    away = factor.pixels - center[factor.intrinsics.index]
-    radius = np.sqrt(np.einsum("ni,ni->n", away, away))
-    along = np.einsum("ni,ni->n", residual, away) / np.maximum(radius, 1e-12)
-    square = np.einsum("ni,ni->n", residual, residual)
+    square = squared_length(residual)
     limit = chi_square_gate(FIT.outlier, 2) * noise_of(square) ** 2
-    counts: BoolArray = (square < limit) & (square > 0.0)
-    if not counts.any():
+    used = np.flatnonzero((square < limit) & (square > 0.0))
+    if not len(used):
         return False
-    ring = _rings(factor.intrinsics.index[counts], radius[counts], len(params), gates.rings)
-    number, total = np.bincount(ring), np.bincount(ring, weights=along[counts])
-    used = number > 0
-    statistic = float(np.sum(total[used] ** 2 / number[used]) / np.mean(along[counts] ** 2))
-    return statistic > chi_square_gate(gates.false_alarm, int(used.sum()))
+    camera = factor.intrinsics.index.take(used)
+    away = factor.pixels.take(used, axis=0) - center.take(camera, axis=0)
+    radius, (x, y) = np.sqrt(squared_length(away)), residual.take(used, axis=0).T
+    along = (x * away[:, 0] + y * away[:, 1]) / np.maximum(radius, 1e-12)
+    ring = _rings(camera, radius, len(params), gates.rings)
+    number, total = np.bincount(ring), np.bincount(ring, weights=along)
+    seen = number > 0
+    statistic = float(np.sum(total[seen] ** 2 / number[seen]) / (along @ along / len(along)))
+    return statistic > chi_square_gate(gates.false_alarm, int(seen.sum()))
 
 
 def _rings(camera: IntArray, radius: FloatArray, cameras: int, rings: int) -> IntArray:
     """Number of the ring of equal area of each observation, counted on from camera to camera."""
     largest = np.zeros(cameras)
     np.maximum.at(largest, camera, radius)
-    share = (radius / np.maximum(largest, 1e-12)[camera]) ** 2
-    return camera.astype(np.int64) * rings + np.minimum((share * rings).astype(np.int64), rings - 1)
+    share = radius / np.maximum(largest, 1e-12).take(camera)
+    return camera.astype(np.int64) * rings + np.minimum((share * share * rings).astype(np.int64), rings - 1)
 
 
 def _may_lack(group: Variables, model: CameraModel, wider: str) -> bool:
@@ -200,5 +211,5 @@ def _wide(group: str) -> str:
 
 def median_px(factors: list[PointReprojection], problem: Problem) -> float:
     """Return the median reprojection error of points, pixels."""
-    squares = [np.einsum("ni,ni->n", r, r) for r in (residuals_of(f, problem.variables) for f in factors)]
+    squares = [squared_length(residuals_of(factor, problem.variables)) for factor in factors]
     return float(np.sqrt(np.median(np.concatenate(squares))))

@@ -32,6 +32,8 @@ from groma.problem.parallel import OrderedSums, Spans, sum_of
 #: Diagonal entries are damped as if they were at least this large, so that nothing is divided by zero. It is no
 #: tolerance: entries change with the square of the unit of length, and what the solver does must not.
 MIN_DIAGONAL = 1e-100
+#: Curvatures count as at least this.
+SMALLEST = float(np.finfo(float).tiny)
 #: Damping of landmarks by kind, relative to that of all other variables; 1 where a kind is not named. The damping is
 #: measured by the diagonal, which says little about the depth of a far point: along its rays the cost is flatter by the
 #: square of the angle between them, and a damping that suits the cameras holds the point back for many steps.
@@ -47,17 +49,22 @@ def invert_blocks(V, g, damping, step, begin, end, N, h, dof):
     """N = -(V + damping D)^-1 and h = N g for landmarks begin..end; undetermined directions do not move.
 
     The damping of landmark p is ``damping[p * step]``: one for all (step 0) or one for each (step 1). Returns how many
-    landmarks have an undetermined direction.
+    landmarks have an undetermined direction, and the largest component of the gradient, squared over its diagonal
+    entry of V: that costs nothing here, where both are in cache.
     """
     n = len(dof)
     L = np.zeros((n, n))
     inverse = np.zeros((n, n))
     pivots = np.zeros(n)
-    singular = 0
+    singular, steepest = 0, 0.0
     for p in range(begin, end):
         v0 = p * n * n
         factor = damping[p * step]
         deficient = False
+        for j in range(n):
+            square = g[p * n + j] * g[p * n + j]
+            if not square <= steepest * V[v0 + j * n + j] and steepest == steepest:
+                steepest = square / max(V[v0 + j * n + j], SMALLEST)  # what is not a number stays
         # V + damping D = L diag(pivots) L^T with a unit lower triangle
         for j in range(n):
             diagonal = V[v0 + j * n + j]
@@ -100,7 +107,7 @@ def invert_blocks(V, g, damping, step, begin, end, N, h, dof):
             for j in range(n):
                 total += N[v0 + i * n + j] * g[p * n + j]
             h[p * n + i] = total
-    return singular
+    return singular, steepest
 
 
 @loop
@@ -190,6 +197,7 @@ class ReducedSystem:
         kinds = [layout.problem.variables[e.group].manifold.kind for e in layout.eliminated]
         self._landmark_damping = [LANDMARK_DAMPING.get(kind, 1.0) for kind in kinds]
         self._singular = [0] * shares
+        self._steepest = [0.0] * shares
         self.num_singular_landmarks = 0
         #: Of the last steps of the landmarks: the sums of delta D delta, with D as their damping takes it, and g delta.
         self.landmark_squares = self.landmark_slope = 0.0
@@ -200,7 +208,7 @@ class ReducedSystem:
         for gradients in self._g:
             for g in gradients:
                 g[:] = 0.0
-        self._singular = [0] * len(self._g)
+        self._singular, self._steepest = [0] * len(self._g), [0.0] * len(self._g)
 
     def eliminate_chunk(self, share: int, chunk: Chunk, damping: float) -> None:
         """Eliminate the landmarks of one chunk of a share, whose chunks follow in their order.
@@ -213,9 +221,11 @@ class ReducedSystem:
         eliminated, equations = self.layout.eliminated[e], self.equations
         dof, N, h, S = width(eliminated.dof), self.N[e], self.h[e], self._sums.of(share)
         own = np.array([damping * self._landmark_damping[e]])
-        self._singular[share] += invert_blocks(
+        singular, steepest = invert_blocks(
             equations.V[e], equations.g_landmarks[e], own, 0, chunk.begin, chunk.end, N, h, dof
         )
+        self._singular[share] += singular
+        self._steepest[share] = float(np.maximum(self._steepest[share], steepest))
         for c, incidences in eliminated.incidences.items():
             _eliminate(
                 incidences.pointer, incidences.block, *equations.blocks_of_chunk(share, chunk, c), N, h,
@@ -269,6 +279,10 @@ class ReducedSystem:
         kept = self.layout.kept[c]
         H = self.equations.H[c, c][: kept.count * kept.width**2].reshape(kept.count, kept.width, kept.width)
         return np.einsum("nii->ni", H)
+
+    def largest_landmark_slope(self) -> float:
+        """Return the largest component of the landmarks' gradient over the root of its diagonal entry of V."""
+        return float(np.sqrt(np.max(self._steepest)))
 
     def incident_products(self, delta_kept: list[FloatArray]) -> list[FloatArray]:
         """Return W delta_c for the landmarks of each eliminated group, (count * dof,)."""
