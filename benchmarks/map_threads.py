@@ -40,11 +40,13 @@ def run(images, model, threads):
     from groma.cli.app import app  # noqa: F401 - the command line is part of every run
     from groma.compilation.loading import loading
     from groma.execution import share_memory, work_with
+    from groma.features.images import one_opencv_thread
     from groma.io import read_scene
     from groma.mapping.map import MapOptions, map_images
 
     mark("reading the model")
     share_memory()
+    one_opencv_thread()
     scene = read_scene(model)
     with tempfile.TemporaryDirectory() as folder, work_with(threads):
         with loading("map", threads):

@@ -51,6 +51,12 @@ def test_statistics_are_not_loaded_for_a_quantile(module):
     assert "scipy.stats" not in _loaded_after(f"import {module}")
 
 
+def test_special_functions_are_loaded_when_a_map_needs_them():
+    """They bring a hundred modules along; by then other threads look for segments."""
+    loaded = _loaded_after("from groma.cli.app import app\nimport groma.mapping.map")
+    assert not loaded & {"scipy.special", "scipy.sparse", "scipy.spatial", "scipy.linalg", "numpy.f2py"}
+
+
 def test_a_plain_adjustment_loads_the_solver_alone(tmp_path):
     """No photographs are looked at, no COLMAP model is read, and of SciPy nothing but LAPACK is needed."""
     source = Path(__file__).parent / "data" / "bal" / "dubrovnik-3-7-18-pre.txt"

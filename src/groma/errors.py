@@ -54,6 +54,13 @@ def is_interrupt(error: BaseException) -> bool:
     return any(isinstance(one, KeyboardInterrupt) for one in causes_of(error))
 
 
+def check_kind(value: object, kinds: type | tuple[type, ...], name: str, way: str) -> None:
+    """Raise InputError unless the argument ``name`` is of a kind; ``way`` is a sentence that says how to get one."""
+    if not isinstance(value, kinds):
+        wanted = " or ".join(kind.__name__ for kind in (kinds if isinstance(kinds, tuple) else (kinds,)))
+        raise InputError(f"{name} must be a {wanted}; got {type(value).__name__}. {way}")
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return the end of a message about a name that is not known: `` Did you mean 'huber'?``; empty if none is near."""
     by_key = {other.lower().replace("-", "_"): other for other in known}

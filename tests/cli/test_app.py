@@ -53,6 +53,7 @@ def test_version(capsys):
         ["adjust", "x", "--max-iterations", "-1"],
         ["synth"],
         ["synth", "-o", "x", "--seed", "-1"],
+        ["synth", "-o", "x", "-n", "99999999999999999999"],
         ["adjust", "x", "--seed", "-1"],
         ["evaluate", "poses", "only-one"],
     ],
@@ -61,6 +62,46 @@ def test_version(capsys):
 def test_wrong_usage_is_exit_code_2(arguments, capsys):
     assert run(arguments) == 2
     assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "where"),
+    [
+        (["adjust", ""], "a value is empty"),
+        (["adjust", "x", "-o", ""], "a value for '-o' is empty"),
+        (["adjust", "x", "--output="], "a value for '--output' is empty"),
+        (["map", "", "-o", "out"], "a value is empty"),
+        (["evaluate", "poses", "a", ""], "a value is empty"),
+    ],
+    ids=str,
+)
+def test_an_empty_name_is_not_the_folder_one_is_in(arguments, where, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run(arguments) == 2
+    assert f"Error: Invalid value: {where}. Is a variable of the shell not set?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["merge", "/", "b", "-o", "out"], "/ holds no COLMAP model"),
+        (["merge", "text.txt", "b", "-o", "out"], "text.txt is not a scene"),
+        (["adjust", "empty"], "; it is empty."),
+        (["adjust", "b", "-o", "text.txt/out"], "text.txt is a file. Choose another place."),
+        (["evaluate", "trajectory", "b", "text.txt"], "Cannot read b: it is a folder. Pass the file in it."),
+        (["evaluate", "lines", "text.txt", "text.txt"], "Line 1: expected X1 Y1 Z1 X2 Y2 Z2 in every line"),
+        (["synth", "-n", "2", "--noise", "inf", "-o", "out"], "noise_px must be a standard deviation"),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_meant_is_told_in_one_line(arguments, words, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "b").mkdir()
+    (tmp_path / "text.txt").write_text("hello world\n")
+    (tmp_path / "empty").touch()
+    assert run(arguments) == 1
+    said = capsys.readouterr().err
+    assert words in said and said.count("\n") == 1
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,8 @@ from groma.localization.pose.focal_length import focal_step
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pose_fit import fit_pose
-from groma.localization.pose.refinement import landmark_weights, problem_of, refine
+from groma.localization.pose.pose_problem import problem_of
+from groma.localization.pose.refinement import landmark_weights, refine
 from groma.solver.options import SolverOptions
 
 #: Ends where a step gains nothing in double precision.

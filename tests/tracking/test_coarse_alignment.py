@@ -45,15 +45,15 @@ def test_a_prediction_gives_way_only_to_what_the_image_shows(frame):
     places = CAMERA.bearings(pixels) * depth[rows, columns][:, None]
     turn = np.concatenate([quaternion.exp(np.array([[0.02, 0.12, 0.0]]))[0], np.zeros(3)])
     now = _turned(gray, so3.exp(np.array([[0.02, 0.12, 0.0]]))[0])
-    nothing = np.zeros((0, 2)), np.zeros((0, 3))
-    found = turned_prediction(CAMERA, gray, now, (pixels, places), lambda: nothing, pose, pose)
+    nothing, small = (np.zeros((0, 2)), np.zeros((0, 3))), (small_image(gray), small_image(now))
+    found = turned_prediction(CAMERA, *small, (pixels, places), lambda: nothing, pose, pose)
     assert found is not None
     assert np.abs(CAMERA.project(into(found, places)) - CAMERA.project(into(turn, places))).max() < 4.0
-    assert turned_prediction(CAMERA, gray, now, (pixels, places), lambda: nothing, pose, turn) is None
+    assert turned_prediction(CAMERA, *small, (pixels, places), lambda: nothing, pose, turn) is None
     few = pixels[:5], places[:5]
-    assert turned_prediction(CAMERA, gray, now, few, lambda: nothing, pose, pose) is None
+    assert turned_prediction(CAMERA, *small, few, lambda: nothing, pose, pose) is None
     # With few points to follow, places all over the image tell.
-    found = turned_prediction(CAMERA, gray, now, few, lambda: (pixels, places), pose, pose)
+    found = turned_prediction(CAMERA, *small, few, lambda: (pixels, places), pose, pose)
     assert found is not None
     assert np.abs(CAMERA.project(into(found, places)) - CAMERA.project(into(turn, places))).max() < 4.0
 
@@ -67,6 +67,7 @@ def test_turns_are_told_though_most_points_leave_the_image(frame):
     now = _turned(gray, turn)
     everywhere = np.mgrid[10:230:20, 10:310:20].reshape(2, -1)[::-1].T
     spread = everywhere + 0.5, CAMERA.bearings(everywhere + 0.5) * depth[everywhere[:, 1], everywhere[:, 0]][:, None]
-    found = turned_prediction(CAMERA, gray, now, (pixels, places), lambda: spread, se3.identity(), se3.identity())
+    small = small_image(gray), small_image(now)
+    found = turned_prediction(CAMERA, *small, (pixels, places), lambda: spread, se3.identity(), se3.identity())
     assert found is not None
     assert np.linalg.norm(so3.log((quaternion.to_matrix(found[:4]) @ turn.T)[None])) < np.radians(1.5)

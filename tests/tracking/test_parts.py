@@ -13,7 +13,7 @@ from groma.features.depth.points import depth_at
 from groma.features.point_tracks import corners, follow, spread
 from groma.geometry import se3
 from groma.scene.landmarks import Lines
-from groma.tracking.frame.camera import TrackCamera, back, into, planes_back, planes_into
+from groma.tracking.frame.camera import TrackCamera, apart, back, into, planes_back, planes_into
 from groma.tracking.frame.depth import segment_inverse_depths
 from groma.tracking.frame.features import segment_noise
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
@@ -269,6 +269,41 @@ def test_segments_are_clipped_to_the_image():
     assert good.tolist() == [True, True, False]
     assert np.allclose(seen[0], [0, 240, 640, 240])
     assert (seen[1] >= 0).all()
+
+
+def test_clipped_segments_are_what_is_seen_of_them():
+    rng = np.random.default_rng(4)
+    ends = rng.uniform((-4.0, -4.0, -3.0), (4.0, 4.0, 5.0), (400, 2, 3))
+    found, seen = CAMERA.project_segments(ends, border=5.0)
+    share = np.linspace(0.0, 1.0, 20_001)[:, None]
+    near = 0.02 * np.median(np.abs(ends[..., 2]))
+    for segment, pixels, is_seen in zip(ends, found, seen, strict=True):
+        along = segment[0] + share * (segment[1] - segment[0])
+        along = along[along[:, 2] >= near]
+        at = CAMERA.project(along)
+        at = at[CAMERA.inside(at, 5.0)]
+        if len(at) < 2:
+            assert not is_seen or np.hypot(*(pixels[2:] - pixels[:2])) < 2.0
+            continue
+        assert is_seen
+        # Steps of the samples are wider near the camera.
+        np.testing.assert_allclose(
+            pixels, np.concatenate([at[0], at[-1]]), atol=1.0 + np.abs(np.diff(at, axis=0)).max()
+        )
+    assert 40 < seen.sum() < 300
+
+
+def test_cameras_are_apart_by_the_way_between_them_and_the_turn():
+    rng = np.random.default_rng(5)
+    for size in (1e-9, 1e-4, 0.3, 3.0):
+        pose = se3.exp(rng.normal(size=(1, 6)))[0]
+        omega = rng.normal(size=3)
+        omega *= size / np.linalg.norm(omega)
+        other = se3.compose(se3.exp(np.concatenate([rng.normal(size=3), omega])[None]), pose[None])[0]
+        centers = se3.inverse(np.stack([pose, other]))[:, 4:]
+        shift, turn = apart(pose, other)
+        assert shift == pytest.approx(np.linalg.norm(centers[1] - centers[0]), rel=1e-12)
+        assert turn == pytest.approx(size, rel=1e-12, abs=1e-15)
 
 
 def test_triangulation():

@@ -65,3 +65,11 @@ def test_patches_are_compared_by_their_correlation():
     np.testing.assert_allclose(_alike(one, two, at, to, 15), expected, atol=1e-9)
     plain = np.full_like(one, 90)
     assert not _alike(plain, plain, at, to, 15).any()
+
+
+@pytest.mark.parametrize("shape", [(60, 80), (61, 83), (3, 3)])
+def test_noise_is_the_median_of_what_planes_of_grey_do_not_make(shape):
+    image = np.random.default_rng(3).integers(0, 256, shape, dtype=np.uint8)
+    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+    wanted = 1.4826 / 6.0 * np.median(np.abs(cv2.filter2D(image, cv2.CV_32F, kernel)[::2, ::2]))
+    assert image_noise(image) == pytest.approx(wanted, rel=1e-6)

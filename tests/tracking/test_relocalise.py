@@ -10,7 +10,7 @@ import pytest
 from groma.features.depth.points import DEPTH_POINTS, depth_at
 from groma.geometry import se3
 from groma.tracking.frame.camera import TrackCamera, into
-from groma.tracking.frame.descriptor_pairs import pair_anywhere, pair_near
+from groma.tracking.frame.descriptor_pairs import PlacedFeatures, pair_anywhere, pair_near
 from groma.tracking.gates import DEFAULT
 from groma.tracking.pose.relocalise import _Search, pose_from_matches
 
@@ -35,7 +35,7 @@ def test_pairs_are_the_most_alike_for_both(radius):
     of = rng.integers(0, 300, 500)  # some are expected twice
     expected = pixel[of] + rng.normal(0, 4.0, (500, 2))
     first = second[of] ^ np.packbits(rng.random((500, 256)) < 0.1, axis=1)
-    found = pair_near(expected, first, pixel, second, radius, 64)
+    found = pair_near(expected, first, PlacedFeatures.of(pixel, second), radius, 64)
     np.testing.assert_array_equal(found, _pairs_by_hand(expected, first, pixel, second, radius, 64))
     assert len(found) > 50
 
@@ -61,9 +61,25 @@ def test_nothing_pairs_with_nothing():
         for one, other in (both, both[::-1]):
             assert [len(rows) for rows in pair_anywhere(one, other, 64)] == [0, 0]
     none, words = np.zeros((0, 2)), np.zeros((0, 32), np.uint8)
-    assert pair_near(none, words, none, words, 10.0, 64).shape == (0, 2)
+    nothing = PlacedFeatures.of(none, words)
+    assert pair_near(none, words, nothing, 10.0, 64).shape == (0, 2)
     one = np.array([[5.0, 5.0]]), np.zeros((1, 32), np.uint8)
-    assert pair_near(*one, none, words, 10.0, 64).shape == (0, 2)
+    assert pair_near(*one, nothing, 10.0, 64).shape == (0, 2)
+    assert pair_near(none, words, PlacedFeatures.of(*one), 10.0, 64).shape == (0, 2)
+
+
+def test_what_is_expected_nowhere_or_outside_pairs_with_nothing():
+    pixel, words = np.array([[3.0, 2.0], [300.0, 200.0]]), np.zeros((2, 32), np.uint8)
+    expected = np.array([[np.nan, np.nan], [-2.0, -1.0], [1e300, 200.0], [-40.0, 2.0], [300.0, np.inf], [3.0, -1e9]])
+    found = pair_near(expected, np.zeros((6, 32), np.uint8), PlacedFeatures.of(pixel, words), 10.0, 64)
+    np.testing.assert_array_equal(found, [[1, 0]])
+
+
+def test_of_pairs_that_are_as_good_those_of_the_first_count():
+    pixel = np.array([[50.0, 20.0], [40.0, 20.0], [45.0, 15.0], [45.0, 25.0]])  # all five pixels away
+    words = np.zeros((4, 32), np.uint8)
+    found = pair_near(np.array([[45.0, 20.0]] * 2), words[:2], PlacedFeatures.of(pixel, words), 5.0, 0)
+    np.testing.assert_array_equal(found, [[0, 0]])
 
 
 def test_a_pose_is_proposed_where_three_matches_of_four_are_wrong():

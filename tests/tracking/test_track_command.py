@@ -3,6 +3,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -63,6 +64,7 @@ def test_what_it_writes(sequence, tmp_path):
     for scene in (read_scene(out), read_scene(out / "scene.npz")):
         assert scene.num_images >= 2
         assert scene.num_lines > 0
+    assert re.findall(r"^ *points +([\d,]+)", result.output, re.MULTILINE) == [f"{scene.num_points:,}"]
     page = (out / "report.html").read_text()
     assert "<html" in page.lower()
     assert "Path from above" in page
@@ -70,6 +72,8 @@ def test_what_it_writes(sequence, tmp_path):
         numbers = json.loads(path.read_text())
         assert numbers["frames"] == {"tracked": 16}
         assert numbers["kind"] == "rgbd"
+        written = [scene.num_points, scene.num_lines, scene.num_planes]
+        assert [numbers[kind] for kind in ("points", "lines", "planes")] == written
     assert not (tmp_path / "out.work").exists()
     again = _run(sequence, "-o", out, "--camera", CAMERA)
     assert again.exit_code == 1

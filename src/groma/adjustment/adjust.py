@@ -42,6 +42,7 @@ from groma.factors.losses import GemanMcClure, Loss, Trivial
 from groma.factors.losses import loss as make_loss
 from groma.problem.problem import Problem
 from groma.scene import Scene
+from groma.scene.checks import check_scene_given
 from groma.scene.local_frame import local_frame
 from groma.solver.options import SolverOptions
 from groma.solver.report import SolveReport
@@ -155,11 +156,7 @@ def adjust(
         If the scene has nothing to adjust, or an option is not known.
     """
     options = options or AdjustOptions()
-    if not isinstance(scene, Scene):
-        raise InputError(
-            f"adjust takes a groma.Scene; got {type(scene).__name__}. Read one with groma.read_scene(path), or turn a "
-            "pycolmap.Reconstruction into one with groma.io.from_pycolmap(reconstruction)."
-        )
+    check_scene_given(scene)
     refuse_focal_lengths(scene)
     if options.camera_model is not None:
         scene, options = _in_model(scene, options, options.camera_model, progress)

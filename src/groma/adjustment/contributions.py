@@ -17,6 +17,7 @@ from groma.errors import InputError, ProblemError
 from groma.evaluation.alignment import align_poses, camera_centers
 from groma.evaluation.poses import evaluate_poses
 from groma.scene import Relations, Scene
+from groma.scene.checks import check_scene_given
 
 #: What is added, one after the other.
 KINDS = ("points", "lines", "planes and directions", "points on lines")
@@ -98,6 +99,7 @@ def contributions(
     InputError
         If the scene has no points to begin with, or no image of the reference.
     """
+    check_scene_given(scene)
     options = replace(options or AdjustOptions(), check_lens=False)
     if not (options.points and scene.num_point_observations):
         raise InputError(

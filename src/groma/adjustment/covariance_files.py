@@ -32,6 +32,7 @@ from groma.bounded.json_text import json_text
 from groma.errors import InputError
 from groma.io import atomic_output
 from groma.scene import Scene
+from groma.scene.checks import check_scene_given
 
 #: Fields of :class:`SceneUncertainty` that go into the file as they are.
 _FIELDS = ("poses", "centers", "points", "lines", "segment_ends", "planes", "directions")
@@ -60,6 +61,7 @@ def write_covariances(
     OutputError
         If something is there already or the file system refuses.
     """
+    check_scene_given(scene)
     if Path(path).suffix not in (".npz", ".json"):
         raise InputError(f"A file of covariances must end in .npz or .json; got {path}.")
     if Path(path).suffix == ".json":

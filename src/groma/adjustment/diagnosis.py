@@ -10,6 +10,7 @@ from groma.adjustment.places import at_places_of
 from groma.adjustment.terms.open_motions import num_open_motions
 from groma.problem.problem import Problem
 from groma.scene import Scene
+from groma.scene.checks import check_scene_given
 from groma.scene.local_frame import local_frame
 from groma.solver.observability.diagnosis import Diagnosis, diagnose
 
@@ -38,6 +39,7 @@ def diagnose_scene(
     Diagnosis
         Cameras are called by the names of their images, landmarks by their identifiers.
     """
+    check_scene_given(scene)
     near = local_frame(scene)
     if near is not None:
         scene = scene.transformed(near)

@@ -14,22 +14,27 @@ camera displaced by -t sees it, and by the left twist :math:`(\rho, \omega)`
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
+from groma.estimators.batch_least_squares import solve_damped
 from groma.factors.losses import Loss, loss_derivatives
 from groma.factors.observations.line_reprojection import endpoint_distance, image_line_norm
 from groma.factors.priors.pose_prior import compose_with_inverse, inverse_left_jacobian, pose_log
 from groma.geometry.charts.chart import perpendicular_kernel
 from groma.geometry.charts.pose_charts import POSE_CHARTS
-from groma.solver.independent import STRETCH, stretch_factor
+from groma.geometry.quaternion import exp_kernel, multiply_kernel, to_matrix_kernel
+from groma.geometry.so3 import left_jacobian_kernel
+from groma.solver.independent import STRETCH
 
 #: Steps under one loss, the relative decrease of the cost that ends them, and the first damping.
 MAX_STEPS, TOLERANCE, FIRST_DAMPING = 8, 1e-3, 1e-6
+_SHORTER, _LONGER, _MOST, _LOWERED = STRETCH.shorter, STRETCH.longer, STRETCH.most, STRETCH.lowered
+_SIX = (None,) * 6
 _CHART = POSE_CHARTS["left"]
 
 
@@ -183,6 +188,82 @@ def _add_prior(T, prior, weights, H, g):
     return cost
 
 
+@loop
+def _sum(pose, seen, loss_tag, parameters, H, g, worst):
+    """Write the normal equations at a pose (7,), lower triangle; return the cost."""
+    K, baseline, offsets, points, lines, planes, prior, prior_weight = seen
+    T, R = np.empty(12), np.empty(9)
+    to_matrix_kernel(pose, R)
+    for i in range(3):
+        for j in range(3):
+            T[4 * i + j] = R[3 * i + j]
+        T[4 * i + 3] = pose[4 + i]
+    H[:, :], g[:] = 0.0, 0.0
+    cost = _add_points(T, K, baseline, points, loss_tag, parameters, H, g, worst[0])
+    if len(lines):
+        cost += _add_lines(T, K, offsets, lines, loss_tag, parameters, H, g, worst[1])
+    if len(planes):
+        cost += _add_planes(T, planes, loss_tag, parameters, H, g, worst[2])
+    if prior_weight.any():
+        cost += _add_prior(T, prior, prior_weight, H, g)
+    return 0.5 * cost
+
+
+@kernel
+def _move(pose, length, step, out):
+    """Write the pose (7,) after ``length`` times a left twist (6,)."""
+    xi, q, R, J = np.empty(6), np.empty(4), np.empty(9), np.empty((3, 3))
+    for k in range(6):
+        xi[k] = length * step[k]
+    omega = xi[3:6]
+    exp_kernel(omega, q)
+    multiply_kernel(q, pose[:4], out[:4])
+    to_matrix_kernel(q, R)
+    left_jacobian_kernel(omega, J)
+    for i in range(3):
+        out[4 + i] = R[3 * i] * pose[4] + R[3 * i + 1] * pose[5] + R[3 * i + 2] * pose[6]
+        out[4 + i] += J[i, 0] * xi[0] + J[i, 1] * xi[1] + J[i, 2] * xi[2]
+    size = 1.0 / math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2] + out[3] * out[3])
+    for k in range(4):
+        out[k] *= size
+
+
+@loop
+def _fit(pose, seen, loss_tag, parameters):
+    """Move a pose (7,) to where it fits best."""
+    worst = np.empty(len(seen[3])), np.empty(len(seen[4])), np.empty(len(seen[5]))
+    H, g, L, step = np.empty((3, 6, 6)), np.empty((3, 6)), np.empty((6, 6)), np.empty(6)
+    tried, other = np.empty(7), np.empty(7)
+    here, there, beyond = 0, 1, 2
+    cost = _sum(pose, seen, loss_tag, parameters, H[here], g[here], worst)
+    damping, growth = FIRST_DAMPING, 2.0
+    for _ in range(MAX_STEPS):
+        fell, promised, found = 0.0, np.inf, np.inf
+        if solve_damped(H[here], -g[here], damping, L, step, _SIX):
+            promised = 0.0
+            for k in range(6):
+                promised += 0.5 * step[k] * (damping * step[k] * H[here, k, k] - g[here, k])
+            _move(pose, 1.0, step, tried)
+            found = _sum(tried, seen, loss_tag, parameters, H[there], g[there], worst)
+            ratio = (cost - found) / max(promised, 1e-300)
+            if promised > TOLERANCE * cost and not _SHORTER <= ratio <= _LONGER:
+                _move(pose, 1.0 / min(max(2.0 - ratio, 1.0 / _MOST), _MOST), step, other)
+                farther = _sum(other, seen, loss_tag, parameters, H[beyond], g[beyond], worst)
+                if farther < found:
+                    tried[:], found = other, farther
+                    there, beyond = beyond, there
+            fell = cost - found
+        before = cost
+        if fell > 0.0:
+            pose[:], cost = tried, found
+            here, there = there, here
+            damping, growth = damping / _LOWERED, 2.0
+        else:
+            fell, damping, growth = promised, damping * growth, 2.0 * growth
+        if fell <= TOLERANCE * before:
+            break
+
+
 # ------------------------------------------------------------------------------------------------------------- Public
 @dataclass(frozen=True)
 class SeenMap:
@@ -200,6 +281,11 @@ class SeenMap:
     #: (12,) pose that was expected, and (6,) inverse standard deviations of its left twist; zeros for none.
     prior: FloatArray
     prior_weight: FloatArray
+
+    @property
+    def tables(self) -> tuple:
+        """All of them, as compiled loops take them."""
+        return tuple(vars(self).values())
 
 
 @dataclass(frozen=True)
@@ -257,17 +343,10 @@ def seen_map(
 
 def equations_at(seen: SeenMap, pose: FloatArray, loss: Loss) -> Equations:
     """Return the normal equations of all that is seen, at a pose (7,)."""
-    T, how = _CHART.ambient(pose[None])[0], (loss.tag, loss.parameters)
     H, g = np.zeros((6, 6)), np.zeros(6)
     worst = np.empty(len(seen.points)), np.empty(len(seen.lines)), np.empty(len(seen.planes))
-    cost = _add_points(T, seen.camera, seen.baseline, seen.points, *how, H, g, worst[0])
-    if len(seen.lines):
-        cost += _add_lines(T, seen.camera, seen.offsets, seen.lines, *how, H, g, worst[1])
-    if len(seen.planes):
-        cost += _add_planes(T, seen.planes, *how, H, g, worst[2])
-    if seen.prior_weight.any():
-        cost += _add_prior(T, seen.prior, seen.prior_weight, H, g)
-    return Equations(0.5 * cost, H + np.tril(H, -1).T, g, worst)
+    cost = _sum(np.asarray(pose, np.float64), seen.tables, loss.tag, loss.parameters, H, g, worst)
+    return Equations(cost, H + np.tril(H, -1).T, g, worst)
 
 
 def without_prior(seen: SeenMap) -> SeenMap:
@@ -277,30 +356,6 @@ def without_prior(seen: SeenMap) -> SeenMap:
 
 def fit_pose(seen: SeenMap, start: FloatArray, loss: Loss) -> FloatArray:
     """Return the pose (7,) that fits best from a start: damped least squares, under a robust loss."""
-    pose, here = start, equations_at(seen, start, loss)
-    damping, growth = FIRST_DAMPING, 2.0
-    for _ in range(MAX_STEPS):
-        diagonal = np.maximum(np.diag(here.H), 1e-300)
-        step = np.linalg.solve(here.H + damping * np.diag(diagonal), -here.g)
-        promised = 0.5 * float(damping * (step * diagonal) @ step - here.g @ step)
-        place, there = _moved(seen, pose, step, loss)
-        ratio = (here.cost - there.cost) / max(promised, 1e-300)
-        if promised > TOLERANCE * here.cost and not STRETCH.shorter <= ratio <= STRETCH.longer:
-            other, beyond = _moved(seen, pose, stretch_factor(ratio) * step, loss)
-            if beyond.cost < there.cost:
-                place, there = other, beyond
-        fell = here.cost - there.cost
-        if fell > 0.0:
-            pose, damping, growth = place, damping / STRETCH.lowered, 2.0
-        else:
-            fell, damping, growth = promised, damping * growth, 2.0 * growth
-        if fell <= TOLERANCE * here.cost:
-            break
-        here = there if pose is place else here
+    pose = np.array(start, dtype=np.float64)
+    _fit(pose, seen.tables, loss.tag, loss.parameters)
     return pose
-
-
-def _moved(seen: SeenMap, pose: FloatArray, step: NDArray[np.floating], loss: Loss) -> tuple[FloatArray, Equations]:
-    """Return where a step leads, and the equations there."""
-    place = _CHART.retract(pose[None], np.asarray(step[None], np.float64))[0]
-    return place, equations_at(seen, place, loss)

@@ -17,6 +17,7 @@ from groma.errors import InputError, ProblemError
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.scene import Scene
+from groma.scene.checks import check_scene_given
 from groma.scene.local_frame import local_frame
 from groma.solver.covariance.marginals import Covariances
 
@@ -111,6 +112,7 @@ def uncertainty(
         If the poses are not determined; :func:`groma.adjustment.diagnosis.diagnose_scene` says what. Landmarks may be
         unobservable.
     """
+    check_scene_given(scene)
     if gauge not in ("auto", "inner", "held"):
         raise InputError(f"gauge must be 'auto', 'inner' or 'held'; got {gauge!r}.")
     options, near = options or AssemblyOptions(), local_frame(scene)

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from groma.cameras.contract import CameraModel
 from groma.cameras.dispatch import kernel_module, set_kernels
-from groma.errors import InputError, did_you_mean
+from groma.errors import InputError, check_kind, did_you_mean
 
 _MODELS: dict[str, CameraModel] = {}
 #: One for every registration of this process.
@@ -63,6 +63,7 @@ def register_camera(
 
 def model(name: str) -> CameraModel:
     """Return the camera model of the given name, for example ``"PINHOLE"``; InputError lists the names if unknown."""
+    check_kind(name, str, "name", "Pass the name of a camera model, such as PINHOLE.")
     if name not in _MODELS:
         known = ", ".join(other.name for other in models())
         raise InputError(

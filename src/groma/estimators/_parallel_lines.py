@@ -28,7 +28,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammaln
+import scipy  # its parts are imported when something of them is first used
 
 from groma._typing import FloatArray, IntArray
 from groma.estimators._direction_features import Parallel
@@ -220,7 +220,11 @@ def _across(pool: Parallel, vectors: FloatArray, gates: ParallelGates) -> FloatA
         axis=2
     )
     bent = np.log1p((vectors @ pool.directions.T) ** 2 / variance.T / gates.freedom)
-    scale = gammaln(0.5 * (gates.freedom + 1.0)) - gammaln(0.5 * gates.freedom) - math.log(math.pi)
+    scale = (
+        scipy.special.gammaln(0.5 * (gates.freedom + 1.0))
+        - scipy.special.gammaln(0.5 * gates.freedom)
+        - math.log(math.pi)
+    )
     return scale - 0.5 * (gates.freedom + 1.0) * bent - 0.5 * np.log(gates.freedom * math.pi * variance.T)
 
 

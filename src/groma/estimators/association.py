@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.special import pdtrc
+import scipy  # its parts are imported when something of them is first used
 
 from groma._numba import loop
 from groma._typing import FloatArray, IntArray
@@ -120,7 +120,7 @@ def log10_poisson_tail(count: float, mean: float) -> float:
         return 0.0
     if mean <= 0.0:
         return -math.inf
-    tail = float(pdtrc(count, mean))
+    tail = float(scipy.special.pdtrc(count, mean))
     # Below the smallest number the first term is nearly all of the sum.
     first = math.floor(count) + 1
     log_tail = math.log(tail) if tail > 0.0 else first * math.log(mean) - mean - math.lgamma(first + 1)

@@ -45,6 +45,7 @@ from groma.evaluation.poses import as_numbers, evaluate_poses
 from groma.geometry.algebra import finite_rows
 from groma.io.geometry import Geometry
 from groma.scene import Scene
+from groma.scene.checks import check_scene_given
 from groma.scene.line_intervals import line_pieces
 
 _CHUNK = 100_000
@@ -145,6 +146,8 @@ def evaluate_lines(
     InputError
         If geometry without poses is to be aligned, and as :func:`score_lines`.
     """
+    check_scene_given(estimate, "estimate", Geometry)
+    check_scene_given(reference, "reference", Geometry)
     segments = estimate.segments if isinstance(estimate, Geometry) else line_pieces(estimate)[0]
     if align:
         if isinstance(estimate, Geometry) or isinstance(reference, Geometry):

@@ -27,6 +27,7 @@ from groma.evaluation.lines import threshold_list
 from groma.evaluation.poses import as_numbers
 from groma.geometry.algebra import finite_rows
 from groma.scene import Scene
+from groma.scene.checks import check_scene_given
 
 #: Numbers held at once while points are compared with planes.
 _CHUNK = 2_000_000
@@ -166,6 +167,8 @@ def evaluate_planes(
     InputError
         If the reference has no planes, or no extent and no offset is given.
     """
+    check_scene_given(estimate, "estimate")
+    check_scene_given(reference, "reference")
     if reference.num_planes == 0:
         raise InputError("The reference has no planes. Pass a scene with planes, or points to compare with.")
     if max_offset is None:

@@ -15,6 +15,7 @@ from groma.evaluation.alignment import align_poses, camera_centers
 from groma.evaluation.gates import SCORES
 from groma.geometry import quaternion
 from groma.scene import Scene, Similarity
+from groma.scene.checks import check_scene_given
 
 #: Thresholds of the area under the curve of pairwise errors, degrees.
 THRESHOLDS_DEG = SCORES.pose_angles_deg
@@ -74,6 +75,8 @@ def evaluate_poses(estimate: Scene, reference: Scene, with_scale: bool = True) -
     InputError
         If a scene has no image, no image is in both, or a name occurs twice in one scene.
     """
+    check_scene_given(estimate, "estimate")
+    check_scene_given(reference, "reference")
     rows = []
     for name, scene in (("estimate", estimate), ("reference", reference)):
         index = {image: row for row, image in enumerate(scene.images.names)}

@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
-from groma.errors import InputError
+from groma.errors import InputError, check_kind
 from groma.evaluation.alignment import pose_alignment
 from groma.evaluation.gates import SCORES
 from groma.evaluation.poses import rotation_angle, unrelated
@@ -156,6 +156,8 @@ def score_trajectory(
     J. Sturm et al., *A benchmark for the evaluation of RGB-D SLAM systems*, 2012; A. Geiger et al., *Are we ready for
     autonomous driving?*, 2012.
     """
+    for name, given in (("estimate", estimate), ("reference", reference)):
+        check_kind(given, Trajectory, name, "Read one with groma.read_trajectory(path).")
     if align not in ("se3", "sim3", "none"):
         raise InputError(f"align must be 'se3', 'sim3' or 'none'; got {align!r}.")
     if rpe_unit not in ("frames", "metres", "seconds"):

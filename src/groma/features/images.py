@@ -60,3 +60,11 @@ def to_gray(image: npt.NDArray[np.generic]) -> GrayImage:
             code = cv2.COLOR_BGR2GRAY if image.shape[2] == 3 else cv2.COLOR_BGRA2GRAY
             image = cv2.cvtColor(np.ascontiguousarray(image, dtype=np.uint8), code)
     return np.ascontiguousarray(image, dtype=np.uint8)
+
+
+def one_opencv_thread() -> None:
+    """Let OpenCV do what it is asked for in the thread that asks, from now on.
+
+    Where photographs are shared out among threads, OpenCV's own would come on top of them.
+    """
+    cv2.setNumThreads(1)

@@ -12,9 +12,21 @@ from groma._typing import BoolArray, FloatArray
 from groma.errors import InputError, ShapeError
 
 
+def numbers(value: npt.ArrayLike, name: str) -> FloatArray:
+    """``value`` as float64, refused with an InputError unless it is an array of real numbers."""
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind != "c":
+            return np.asarray(array, dtype=np.float64)
+        reason = "it is complex"
+    except (TypeError, ValueError) as error:
+        reason = str(error)
+    raise InputError(f"{name} must be an array of real numbers; got {type(value).__name__} ({reason.rstrip('.')}).")
+
+
 def vectors(value: npt.ArrayLike, size: int, name: str, what: str = "") -> FloatArray:
     """``value`` as float64, refused with a ShapeError unless its last axis has ``size`` entries, which are ``what``."""
-    array = np.asarray(value, dtype=np.float64)
+    array = numbers(value, name)
     if array.ndim == 0 or array.shape[-1] != size:
         turned = array.ndim == 2 and array.shape[0] == size and name.isidentifier()
         hint = f" Did you mean {name}.T?" if turned else ""
@@ -25,7 +37,7 @@ def vectors(value: npt.ArrayLike, size: int, name: str, what: str = "") -> Float
 
 def as_rows(array: npt.ArrayLike, row: tuple[int, ...], name: str) -> FloatArray:
     """``array`` as contiguous float64 of shape (N, *row), refused with a ShapeError otherwise."""
-    rows = np.ascontiguousarray(array, dtype=np.float64)
+    rows = np.ascontiguousarray(numbers(array, name))
     if rows.shape[1:] != row:
         hints = {row + rows.shape[1:]: f"{name}.T", row: f"{name}[None]"}
         hint = f" Did you mean {hints[rows.shape]}?" if rows.shape in hints else ""
@@ -35,7 +47,7 @@ def as_rows(array: npt.ArrayLike, row: tuple[int, ...], name: str) -> FloatArray
 
 def matrices(value: npt.ArrayLike, rows: int, columns: int, name: str) -> FloatArray:
     """``value`` as float64, refused with a ShapeError unless it ends in ``rows`` x ``columns``."""
-    array = np.asarray(value, dtype=np.float64)
+    array = numbers(value, name)
     if array.shape[-2:] != (rows, columns):
         raise ShapeError(
             f"{name} must have shape (..., {rows}, {columns}); got {array.shape}. Pass one matrix per item."
@@ -45,7 +57,7 @@ def matrices(value: npt.ArrayLike, rows: int, columns: int, name: str) -> FloatA
 
 def finite_rows(name: str, values: npt.ArrayLike, row: tuple[int, ...]) -> FloatArray:
     """``values`` as finite float64 of shape (N, *row), refused with a ShapeError or an InputError otherwise."""
-    array = np.asarray(values, dtype=np.float64)
+    array = numbers(values, name)
     if array.shape[1:] != row:
         wanted = ", ".join(map(str, row))
         raise ShapeError(f"{name} must have shape (N, {wanted}); got {array.shape}.")

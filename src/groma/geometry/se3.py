@@ -31,7 +31,7 @@ from groma._numba import kernel
 from groma._typing import FloatArray
 from groma.errors import ShapeError
 from groma.geometry import quaternion, so3
-from groma.geometry.algebra import matrices, unit, vectors
+from groma.geometry.algebra import matrices, numbers, unit, vectors
 from groma.geometry.so3 import exp_kernel as rotation_exp_kernel
 from groma.geometry.so3 import left_jacobian_kernel
 
@@ -88,7 +88,7 @@ def to_matrix(pose: FloatArray) -> FloatArray:
 
 def from_matrix(matrix: FloatArray) -> FloatArray:
     """Poses (..., 7) of 4x4 or 3x4 matrices [R | t]; R is not checked for orthonormality."""
-    matrix = np.asarray(matrix, dtype=np.float64)
+    matrix = numbers(matrix, "matrix")
     if matrix.ndim < 2 or matrix.shape[-2] not in (3, 4) or matrix.shape[-1] != 4:
         raise ShapeError(f"A pose matrix must have shape (..., 3, 4) or (..., 4, 4); got {matrix.shape}.")
     return np.concatenate([quaternion.from_matrix(matrix[..., :3, :3]), matrix[..., :3, 3]], axis=-1)
@@ -129,9 +129,9 @@ def looking_at(centers: npt.ArrayLike, targets: npt.ArrayLike, up: npt.ArrayLike
     -------
     (..., 7) float64
     """
-    centers, targets = np.broadcast_arrays(np.asarray(centers, np.float64), np.asarray(targets, np.float64))
+    centers, targets = np.broadcast_arrays(vectors(centers, 3, "centers"), vectors(targets, 3, "targets"))
     ahead = unit(targets - centers)
-    right = unit(np.cross(ahead, np.asarray(up, np.float64)))
+    right = unit(np.cross(ahead, vectors(up, 3, "up")))
     rotation = np.stack([right, np.cross(ahead, right), ahead], axis=-2)
     q, t = quaternion.from_matrix(rotation), -(rotation @ centers[..., None])[..., 0]
     return np.concatenate([q, t], axis=-1, dtype=np.float64)

@@ -30,7 +30,7 @@ import numpy.typing as npt
 from groma._typing import FloatArray
 from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion, so3
-from groma.geometry.algebra import matrices, vectors
+from groma.geometry.algebra import matrices, numbers, vectors
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
 _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
@@ -42,7 +42,7 @@ def _similarities(similarity: FloatArray) -> FloatArray:
             "A similarity is one array (..., 8), quaternion x y z w, translation, scale; got a tuple. Of scale, "
             "rotation matrix and translation groma.geometry.sim3.from_parts(s, R, t) makes it."
         )
-    similarity = np.asarray(similarity, dtype=np.float64)
+    similarity = numbers(similarity, "similarity")
     if similarity.ndim == 0 or similarity.shape[-1] != 8:
         raise ShapeError(
             "A similarity must have shape (..., 8), quaternion x y z w, translation, scale; "
@@ -64,7 +64,7 @@ def identity(*batch: int) -> FloatArray:
 
 def from_parts(scale: npt.ArrayLike, rotation: npt.ArrayLike, translation: npt.ArrayLike) -> FloatArray:
     """Similarities (..., 8) of scales (...), rotations (..., 3, 3) and translations (..., 3); they broadcast."""
-    s, R, t = (np.asarray(part, dtype=np.float64) for part in (scale, rotation, translation))
+    s, R, t = numbers(scale, "scale"), numbers(rotation, "rotation"), numbers(translation, "translation")
     if R.shape[-2:] != (3, 3) or t.shape[-1:] != (3,):
         raise ShapeError(f"A rotation must have shape (..., 3, 3), a translation (..., 3); got {R.shape}, {t.shape}.")
     leading = np.broadcast_shapes(s.shape, R.shape[:-2], t.shape[:-1])
@@ -92,7 +92,7 @@ def to_matrix(similarity: FloatArray) -> FloatArray:
 
 def from_matrix(matrix: FloatArray) -> FloatArray:
     """Similarities (..., 8) of 4x4 or 3x4 matrices [sR | t]; the scale is the cube root of the determinant."""
-    matrix = np.asarray(matrix, dtype=np.float64)
+    matrix = numbers(matrix, "matrix")
     if matrix.ndim < 2 or matrix.shape[-2] not in (3, 4) or matrix.shape[-1] != 4:
         raise ShapeError(f"A similarity matrix must have shape (..., 3, 4) or (..., 4, 4); got {matrix.shape}.")
     determinant = np.linalg.det(matrix[..., :3, :3])

@@ -29,6 +29,7 @@ from groma.io.atomic import atomic_output
 from groma.io.reading import existing, reading
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Distances, Scene
+from groma.scene.checks import check_scene_given
 from groma.scene.survey import Kind
 
 FORMAT, VERSION = "groma scene", 1
@@ -40,6 +41,7 @@ _COLUMNS_OF_DISTANCES = ("first_idx", "second_idx", "distance", "sigma")
 
 def write_archive(scene: Scene, path: str | os.PathLike[str], force: bool = False) -> None:
     """Write a scene as a groma archive."""
+    check_scene_given(scene)
     with atomic_output(path, force) as draft, zipfile.ZipFile(draft, "w") as file:
         _write_array(file, "format", np.array(FORMAT))
         _write_array(file, "version", np.array(VERSION))

@@ -32,6 +32,7 @@ from groma.io.pose_conventions import BAL, FLIP
 from groma.io.reading import existing, reading
 from groma.io.registry import HEAD_BYTES, SceneFormat, register_format
 from groma.scene import Cameras, PointObservations, Points, Scene
+from groma.scene.checks import check_scene_given
 
 #: The rotation by pi about x, which is :data:`FLIP`.
 _FLIP_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
@@ -85,6 +86,7 @@ def write_bal(scene: Scene, path: str | os.PathLike[str], force: bool = False) -
     InputError
         If the scene holds lines or planes, or cameras that the BAL model cannot express (see :func:`bal_params`).
     """
+    check_scene_given(scene)
     params, principal_point = check_bal(scene)
     seen = scene.point_observations
     pixel = (seen.pixel - principal_point[seen.image_idx]) * [1, -1]

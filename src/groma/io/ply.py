@@ -25,6 +25,7 @@ from groma.io.atomic import atomic_output
 from groma.io.drawn import PARTS, Part, drawn
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Scene
+from groma.scene.checks import check_scene_given
 from groma.scene.patches import triangle_fans
 
 
@@ -57,6 +58,7 @@ def write_ply(scene: Scene, path: str | os.PathLike[str], force: bool = False, p
     parts : collection of str
         Any of ``points``, ``lines`` and ``planes``.
     """
+    check_scene_given(scene)
     geometry = _geometry(scene, parts)
     vertices = np.zeros(len(geometry.places), [("xyz", "<f8", 3), ("color", "u1", 3)])
     vertices["xyz"], vertices["color"] = geometry.places, geometry.colours
@@ -84,6 +86,7 @@ def write_obj(scene: Scene, path: str | os.PathLike[str], force: bool = False, p
 
     Colours stand behind the coordinates, as most programs expect them. Points, lines and every plane are objects.
     """
+    check_scene_given(scene)
     geometry = _geometry(scene, parts)
     shares = np.round(geometry.colours / 255.0, 4).tolist()
     rows = [

@@ -25,7 +25,9 @@ def reading(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
         raise
     except GromaError as error:
         raise FileFormatError(f"{path} is not a usable {kind}: {error}") from error
-    except (FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError) as error:
+    except IsADirectoryError as error:
+        raise InputError(f"Cannot read {error.filename or path}: it is a folder. Pass the file in it.") from error
+    except (FileNotFoundError, PermissionError, NotADirectoryError) as error:
         raise InputError(f"Cannot read {path}: {error.strerror or error}. Check the path.") from error
     except MemoryError as error:
         raise FileFormatError(f"{path} is too large for the memory of this machine, or damaged.") from error

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from groma._counted import counted
 from groma._typing import FloatArray, IntArray
 from groma.bounded.arrays import opened_arrays, read_array
 from groma.bounded.text import finite, read_words, whole
@@ -94,7 +95,8 @@ def read_line3dpp(path: str | os.PathLike[str]) -> ReferenceLines:
             count = whole(words[6], f"Line {number}", "N, how many images see the line") if len(words) > 6 else -1
             if count < 0 or len(words) != 7 + 5 * count:
                 raise FileFormatError(
-                    f"Line {number}: expected 6 coordinates, N and 5 N words; got {len(words)} words."
+                    f"Line {number}: expected X1 Y1 Z1 X2 Y2 Z2 in every line, or these, N and N times "
+                    f"image u1 v1 u2 v2; got {counted(len(words), 'words')}."
                 )
             for at in range(7, len(words), 5):
                 lines.append(len(ends))

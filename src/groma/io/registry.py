@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from groma.errors import FileFormatError, InputError
 from groma.io.reading import existing, reading
 from groma.scene import Scene
+from groma.scene.checks import check_scene_given
 
 if TYPE_CHECKING:
     from groma.io.limap.structures import Structures
@@ -113,8 +114,8 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
             return one.read(place)
     if place.is_dir() and (colmap := _FORMATS["colmap"].read) is not None:
         return colmap(place)  # it says what is missing in the folder
-    begin = head[:20].decode(errors="backslashreplace")
-    raise FileFormatError(f"{place} is not a scene: expected {_sources(readable)}; it begins with {begin!r}.")
+    begin = f"begins with {head[:20].decode(errors='backslashreplace')!r}" if head else "is empty"
+    raise FileFormatError(f"{place} is not a scene: expected {_sources(readable)}; it {begin}.")
 
 
 def write_scene(
@@ -173,8 +174,7 @@ def check_target(scene: Scene, path: str | os.PathLike[str], format: str = "auto
     InputError
         If the format is unknown or cannot hold the scene.
     """
-    if not isinstance(scene, Scene):
-        raise InputError(f"What is written must be a groma.Scene; got {type(scene).__name__}. Pass result.scene.")
+    check_scene_given(scene)
     suffix = Path(path).suffix.lower()
     writable = [one for one in _FORMATS.values() if one.write is not None]
     if format == "auto":

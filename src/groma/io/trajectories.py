@@ -116,7 +116,7 @@ def read_trajectory(
     with reading(place, "trajectory"):
         rows = read_lines(place)
         if (first := next(rows, None)) is None:
-            raise FileFormatError(f"{place} holds no pose.")
+            raise FileFormatError(f"{place} holds no pose. Expected one in each line, of {', '.join(_FORMATS)}.")
         chosen = _recognise(place, *first) if format == "auto" else _FORMATS[format]
         read = chosen.read(place, chain([first], rows))
         if timestamps is None or chosen.has_times:

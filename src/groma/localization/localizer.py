@@ -39,6 +39,7 @@ from groma.localization.repeated import Described, alike_limits
 from groma.localization.retrieval import VladRetrieval
 from groma.mapping.photographs import check_cameras, read_gray
 from groma.scene import Scene
+from groma.solver.linear.blas import one_blas_thread
 
 
 @dataclass(frozen=True)
@@ -176,12 +177,13 @@ class Localizer:
 
     def _localize(self, gray: GrayImage, camera: QueryCamera, options: PoseOptions) -> LocalizedImage:
         start = time.perf_counter()
-        query = find_features(gray, camera, self.options.lines, self.options.min_segment_length)
-        described = time.perf_counter()
-        images = self._alike(query.points)
-        pose, last = self._coarsely(query, camera, options, images)
-        if pose.status != "localized" or pose.votes < self.options.gates.plain:
-            pose, last = self._fully(query, camera, options, images)
+        with one_blas_thread():
+            query = find_features(gray, camera, self.options.lines, self.options.min_segment_length)
+            described = time.perf_counter()
+            images = self._alike(query.points)
+            pose, last = self._coarsely(query, camera, options, images)
+            if pose.status != "localized" or pose.votes < self.options.gates.plain:
+                pose, last = self._fully(query, camera, options, images)
         done = time.perf_counter()
         return LocalizedImage(pose, last.points[:, 1], last.lines[:, 1], described - start, done - described)
 
@@ -273,7 +275,11 @@ def _folder(map_: object, images: str | os.PathLike[str] | None, index: Path | N
 
 def photographs_of(map_: str | os.PathLike[str], images: str | os.PathLike[str] | None = None) -> Path:
     """Return the folder of the photographs of a map: as given, or as it tells; InputError where it does not."""
-    return _folder(map_, images, index_file(Path(map_)))
+    try:
+        return _folder(map_, images, index_file(Path(map_)))
+    except InputError:
+        read_scene(map_)  # what is no map at all tells nothing of photographs, either
+        raise
 
 
 def unknown_camera(width: int, height: int) -> QueryCamera:
@@ -285,7 +291,7 @@ def unknown_camera(width: int, height: int) -> QueryCamera:
 def index_file(map_: Path) -> Path:
     """Return the file beside a map in which its descriptions are kept."""
     path = map_.absolute()
-    return path.with_name(f"{path.name}.index.npz")
+    return path.parent / f"{path.name}.index.npz"
 
 
 def check_map(scene: Scene) -> None:

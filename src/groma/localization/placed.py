@@ -24,6 +24,7 @@ _FORMS = {
     **dict.fromkeys(("point", "line"), form("iu", None)),
     "covariance": form("f", None, None), "size": form("iu", 2), "pixel": form("f", None, 2),
     "segment": form("f", None, 4), "seconds": form("f"), "shared_error": form("f"),
+    "feature_seconds": form("f"),
 }  # fmt: skip
 
 
@@ -52,6 +53,8 @@ class PlacedImage:
     seconds: float
     #: What parts of the map are off by, as seen from the camera, radians: part of the covariance.
     shared_error: float = 0.0
+    #: Seconds of finding features.
+    feature_seconds: float = 0.0
 
     @property
     def is_whole(self) -> bool:
@@ -83,7 +86,7 @@ class PlacedImage:
                 entry["rotation_sigma_deg"] = float(np.rad2deg(np.sqrt(np.trace(self.covariance[3:, 3:]))))
         entry |= {"num_point_inliers": len(self.point), "num_line_inliers": len(self.line)}
         entry["shared_error_deg"] = float(np.rad2deg(self.shared_error))
-        return entry | {"seconds": self.seconds, "sentence": self.sentence}
+        return entry | {"feature_seconds": self.feature_seconds, "seconds": self.seconds, "sentence": self.sentence}
 
     def write(self, path: Path, digest: str) -> None:
         """Write it whole or not at all."""
@@ -114,6 +117,7 @@ def placed(name: str, found: LocalizedImage) -> PlacedImage:
         pose.matches.segments2d[lines].reshape(-1, 4),
         found.seconds,
         pose.matches.shared_error,
+        found.feature_seconds,
     )
 
 
@@ -135,7 +139,7 @@ def read_placed(path: Path, digest: str) -> PlacedImage | None:
             values: dict[str, Any] = {name: members.read(name, check) for name, check in _FORMS.items()}
             for name in ("name", "status", "sentence", "model"):
                 values[name] = str(values[name])
-            for name in ("seconds", "shared_error"):
+            for name in ("seconds", "shared_error", "feature_seconds"):
                 values[name] = float(values[name])
             found = PlacedImage(**values)
             if found.model:

@@ -18,6 +18,7 @@ from groma.localization.map_index import digest_of
 from groma.localization.placed import PlacedImage, placed, read_placed, unreadable
 from groma.mapping.folder_lock import lock_folder
 from groma.mapping.photographs import image_files, read_gray
+from groma.solver.linear.blas import one_blas_thread
 
 
 def query_files(queries: list[Path]) -> dict[str, Path]:
@@ -65,7 +66,7 @@ def localize_images(
     """
     say, choice = logged_stages("localization", progress), choice or CalibrationChoice()
     told = f"{digest_of(localizer.scene, localizer.files)} {localizer.options} {choice}"
-    with lock_folder(work):
+    with lock_folder(work), one_blas_thread():
         one = partial(_kept, localizer, choice, work, told)
         return map_work(one, list(files.items()), partial(say, "localising photographs"))
 

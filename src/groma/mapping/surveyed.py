@@ -23,6 +23,7 @@ from groma.mapping.checkpoint_files import SCENE
 from groma.mapping.checkpoints import stage
 from groma.mapping.noise.observations import noise_px
 from groma.scene import Scene, Similarity
+from groma.scene.checks import check_scene_given
 from groma.scene.local_frame import usual_frame
 from groma.scene.survey import with_rejected
 
@@ -90,6 +91,7 @@ def adjust_surveyed(
     InputError
         If measurements and scene do not fit together.
     """
+    check_scene_given(scene)
     surveyed = (
         with_survey(scene, survey) if survey else Surveyed(scene, Similarity(), WorldFrame("the frame of the scene"))
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -64,7 +65,11 @@ class Variables:
         return np.broadcast_to(~constant, (len(self), self.manifold.dof)).copy()
 
     def ambient(self) -> FloatArray:
-        """Return what factors read, (count, ambient_size)."""
+        """Return what factors read, (count, ambient_size); it is computed once, and not to be written to."""
+        return self._ambient
+
+    @cached_property
+    def _ambient(self) -> FloatArray:
         return self.manifold.ambient(self.state)
 
     def with_state(self, state: FloatArray) -> Variables:

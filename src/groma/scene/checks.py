@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What makes a scene valid: all references point somewhere, quaternions are of unit length, cameras are consistent."""
+"""What makes a scene valid: all references point somewhere, quaternions are of unit length, cameras are consistent.
+
+And what callers pass where a scene is wanted: refused, with the way to one, unless it is a scene.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +10,28 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from groma.errors import InputError
+from groma.errors import InputError, check_kind
 from groma.scene.camera import CAMERA
 from groma.scene.table import OBJECTS, check_index, check_quaternions, object_references, references
 
 if TYPE_CHECKING:
     from groma.scene.scene import Scene
+
+
+def check_scene_given(value: object, name: str = "scene", *other: type) -> None:
+    """Raise InputError unless a value is a scene, or of another kind that will do; ``name`` is that of the argument."""
+    from groma.scene.scene import Scene
+
+    if isinstance(value, (Scene, *other)):
+        return
+    has_one = isinstance(getattr(value, "scene", None), Scene)
+    way = (
+        "It has a scene: pass its .scene."
+        if has_one
+        else "Read one with groma.read_scene(path), or turn a pycolmap.Reconstruction into one with "
+        "groma.io.from_pycolmap(reconstruction)."
+    )
+    check_kind(value, (Scene, *other), name, way)
 
 
 def check_scene(scene: Scene) -> None:

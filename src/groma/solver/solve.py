@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from groma._typing import FloatArray
+from groma.errors import check_kind
 from groma.execution import available_cores
 from groma.problem.lay_out import lay_out
 from groma.problem.layout import Layout
@@ -78,6 +79,7 @@ def solve(problem: Problem, options: SolverOptions | None = None, progress: Prog
     ProblemError
         If a factor couples two landmarks that were both to be eliminated.
     """
+    check_kind(problem, Problem, "problem", "Make one: groma.Problem(variables, factors).")
     options = options or SolverOptions()
     report = SolveReport(num_factors=sum(map(len, problem.factors)), num_residuals=problem.num_residuals)
     watch = Stopwatch(report)

@@ -50,7 +50,7 @@ from groma.tracking.outcome import (
     TrackedFrame,
     TrackResult,
 )
-from groma.tracking.pose.following import Attempt, find_points_again, follow_frame, follow_nearby
+from groma.tracking.pose.following import Attempt, find_lines_again, find_points_again, follow_frame, follow_nearby
 from groma.tracking.pose.initialise import Initialiser
 from groma.tracking.pose.prediction import MotionModel
 from groma.tracking.pose.relocalise import Found, promote
@@ -168,6 +168,9 @@ class Tracker:
         if estimate.weak and status == TRACKED:
             status = WEAK
         self._lost_for = 0
+        if found is None:
+            with watch("lines"):
+                followed = find_lines_again(self.map, data, pose, followed)
         present.pose, present.data, present.followed = pose, data, followed
         present.frames_since_keyframe += 1
         # What was found by features alone cannot be followed; the next frame needs this one's landmarks.
@@ -235,7 +238,7 @@ class Tracker:
         with watch("find"), work_with(None if mapper.threaded else 1):
             guesses = [attempt.predicted, present.pose] + ([unconfirmed.pose] if unconfirmed is not None else [])
             found = self._verification.find(
-                self.map, data, guesses, attempt.predicted, attempt.prior_sigma, self._lost_for
+                self.map, data, guesses, attempt.predicted, attempt.prior_sigma, self._lost_for, mapper.frame_pool
             )
         if found is not None and not (
             attempt.trusted and unconfirmed is not None and self._verification.score(unconfirmed) >= found.score
@@ -263,7 +266,7 @@ class Tracker:
         tracks = present.followed.points
         tracks = tracks.take(points.alive[tracks.index])
         better = turned_prediction(
-            self.camera, present.data.gray, data.gray, (tracks.pixel, points.xyz[tracks.index]),
+            self.camera, present.data.small, data.small, (tracks.pixel, points.xyz[tracks.index]),
             partial(present.data.spread_places, present.pose), present.pose, predicted, gates,
         )  # fmt: skip
         if better is None:
@@ -374,6 +377,7 @@ class Tracker:
         adjusted = ending.adjust(main).numbers(self.camera)  # finds planes, which are counted
         statistics = self.statistics() | adjusted
         whole, *submaps = [ending.submap(root) for root in (main, *others)]
+        statistics |= {kind: len(getattr(whole.scene, kind)) for kind in ("points", "lines", "planes")}  # as written
         warnings = [*self._checks.warnings, *ending.warnings]
         if not history.entries:
             warnings.append("No map was made: no frame could be used, or the camera did not move enough to start.")

@@ -21,7 +21,7 @@ import numpy as np
 from groma._counted import counted
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.report import Progress, not_converged
-from groma.errors import InputError
+from groma.errors import InputError, check_kind
 from groma.factors.contract import Ref
 from groma.factors.losses import Loss, Trivial
 from groma.factors.losses import loss as make_loss
@@ -132,6 +132,7 @@ def adjust_pose_graph(
     InputError
         If the graph has no motions.
     """
+    check_kind(graph, PoseGraph, "graph", "Read one with groma.io.read_g2o(path).")
     options = options or PoseGraphOptions()
     if not len(graph.motions):
         poses = counted(len(graph.poses), "poses")

@@ -17,6 +17,7 @@ from groma.adjustment.terms.relations import ANGLES
 from groma.errors import InputError, OutputError
 from groma.io.archive import read_archive, write_archive
 from groma.scene import Scene
+from groma.scene.checks import check_scene_given
 from groma.scene.survey import Kind
 from groma.scene.table import object_references
 
@@ -71,6 +72,7 @@ def write_parts(
     OutputError
         If an archive exists already, or cannot be written.
     """
+    check_scene_given(scene)
     if len(scene.camera_motions):
         raise InputError("Scenes with a rolling shutter are not adjusted in parts. Adjust the scene as a whole.")
     folder = Path(folder)

@@ -17,6 +17,7 @@ from groma.errors import InputError
 from groma.evaluation.alignment import camera_centers, pose_alignment
 from groma.geometry import quaternion
 from groma.scene import Scene, Similarity
+from groma.scene.checks import check_scene_given
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +75,8 @@ def align(scene: Scene, reference: Scene | Survey) -> Alignment:
     InputError
         If less than three places are known in both frames, or these are mirror images of each other.
     """
+    check_scene_given(scene)
+    check_scene_given(reference, "reference", Survey)
     if isinstance(reference, Survey):
         return _to_survey(scene, reference)
     rows = rows_by_name(scene.images.names, reference.images.names)

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtri
+import scipy  # its parts are imported when something of them is first used
 
 from groma.gates import gate
 
@@ -115,7 +115,7 @@ class Reliability:
     @property
     def limit(self) -> float:
         """Normalised residuals beyond are called wrong."""
-        return float(-ndtri(self.level / 2.0))
+        return float(-scipy.special.ndtri(self.level / 2.0))
 
     @property
     def suspects(self) -> tuple[Measurement, ...]:
@@ -141,7 +141,7 @@ class Reliability:
 def rejection_limit(measurements: Sequence[Measurement]) -> float:
     """Return the normalised residual that none of so many good measurements exceeds, but for a small probability."""
     tests = sum(one.normalized is not None for one in measurements)
-    return float(-ndtri(GATES.false_alarm / (2.0 * max(tests, 1))))
+    return float(-scipy.special.ndtri(GATES.false_alarm / (2.0 * max(tests, 1))))
 
 
 def gross_errors(measurements: Sequence[Measurement]) -> dict[tuple[str, int], float]:
@@ -164,4 +164,4 @@ def gross_errors(measurements: Sequence[Measurement]) -> dict[tuple[str, int], f
 
 def noncentrality(level: float = GATES.level, power: float = GATES.power) -> float:
     """Return by how many standard deviations a mean must be off for a two-sided test to find it with a power."""
-    return float(ndtri(power) - ndtri(level / 2.0))
+    return float(scipy.special.ndtri(power) - scipy.special.ndtri(level / 2.0))

@@ -31,7 +31,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.special import ndtri
+import scipy  # its parts are imported when something of them is first used
 
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import AssemblyOptions, assemble
@@ -57,6 +57,7 @@ from groma.problem.problem import Problem
 from groma.problem.residuals import jacobians_of
 from groma.problem.variables import Variables
 from groma.scene import Scene
+from groma.scene.checks import check_scene_given
 from groma.scene.local_frame import local_frame
 from groma.scene.survey import accepted, only_rejected
 from groma.solver.covariance.marginals import Covariances
@@ -100,6 +101,7 @@ def reliability(
     ProblemError
         If the poses are not determined.
     """
+    check_scene_given(scene)
     if not scene.has_survey:
         return None
     near = local_frame(scene)
@@ -293,7 +295,7 @@ def _rows(scene: Scene, test: _Test, level: float, power: float) -> Iterator[Mea
     deviation = np.sqrt(np.einsum("nii->ni", np.linalg.inv(test.information)))
     scores = np.einsum("nij,nj->ni", test.information, test.full)
     of_scores = np.einsum("nij,njk,nki->ni", test.information, test.cofactor, test.information)
-    limit, shift = float(-ndtri(level / 2.0)), noncentrality(level, power)
+    limit, shift = float(-scipy.special.ndtri(level / 2.0)), noncentrality(level, power)
     angles = _ANGLES.get(test.kind, (False,) * 6)
     for row, index in enumerate(_rows_in_scene(scene, test).tolist()):
         name = _name(scene, test.kind, index)

@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 from groma.cli.shared import options as _options
 from groma.cli.shared.console import Console
 
+#: Cameras (cost: memory, some kilobytes for each).
+MOST = 1_000_000
 Kind = Literal["holistic", "corridor"]
 
 
@@ -21,7 +23,9 @@ def synth(
             "holistic: cameras on a sphere look into a cube of points, lines, planes. corridor: a walk."
         ),
     ] = "holistic",
-    cameras: Annotated[int, _options.PLAIN.option("Number of cameras.", "--cameras", "-n", min=2, metavar="N")] = 50,
+    cameras: Annotated[
+        int, _options.PLAIN.option("Number of cameras.", "--cameras", "-n", min=2, max=MOST, metavar="N")
+    ] = 50,
     noise: Annotated[
         float | None,
         _options.PLAIN.option(

@@ -65,7 +65,12 @@ class Command(TyperCommand):
                     formatter.write_dl(records)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse as usual."""
+        """Parse as usual, but refuse what is empty: as a name it would stand for the folder that one is in."""
+        for before, word in zip(["", *args], args, strict=False):
+            option, _, value = word.partition("=") if word.startswith("--") else (before, "", word)
+            if not value and (word.endswith("=") or not word):
+                where = f" for {option!r}" if option.startswith("-") else ""
+                raise typer.BadParameter(f"a value{where} is empty. Is a variable of the shell not set?", ctx=ctx)
         try:
             return super().parse_args(ctx, args)
         except typer.BadParameter as error:

@@ -43,11 +43,13 @@ def run_map(
     from groma.cli.shared.interrupt import interruptible
     from groma.compilation.loading import loading
     from groma.execution import share_memory
+    from groma.features.images import one_opencv_thread
     from groma.mapping.checkpoints import check_free, has_stages
     from groma.mapping.map import map_images
 
     check_free(work)
     share_memory()
+    one_opencv_thread()
     console.expect_compilation("map")
     start: Start = "photographs" if model is None else "model" if model.num_point_observations else "poses"
     console.expect_stages(

@@ -60,7 +60,8 @@ def check_output(path: Path, force: bool, file: bool = False) -> None:
     """
     parent = path.absolute().parent
     if not parent.is_dir():
-        raise OutputError(f"Cannot write {path}: the folder {parent} does not exist. Make it first.")
+        wrong = "is a file. Choose another place." if parent.is_file() else "does not exist. Make it first."
+        raise OutputError(f"Cannot write {path}: the folder {parent} {wrong}")
     try:
         tempfile.TemporaryDirectory(prefix=".groma.", dir=parent).cleanup()
     except OSError as error:

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from groma._typing import BoolArray, FloatArray
-from groma.errors import InputError
+from groma.errors import InputError, check_kind
 from groma.estimators.motion.degeneracy import what_is_common, why_open
 from groma.estimators.motion.groups import FREEDOM, Kind, changed_frame, moved, tangent_between
 from groma.estimators.motion.hypotheses import SAMPLE, propose
@@ -121,6 +121,7 @@ def estimate_motion(matches: LandmarkMatches, kind: Kind = "rigid", options: Mot
         If no motion has more than chance agreement, two have the same, or the matches leave a part of it open; the
         message says which.
     """
+    check_kind(matches, LandmarkMatches, "matches", "Put the lines and points into one, row by row.")
     options = options or MotionOptions()
     if kind not in FREEDOM:
         raise InputError(f"kind must be one of {', '.join(FREEDOM)}; got {kind!r}.")

@@ -40,6 +40,7 @@ from groma.io.reading import reading
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Cameras, Frames, Images, Keypoints, PointObservations, Points, Rigs, Scene, Sensors
 from groma.scene.camera import CAMERA, OTHER
+from groma.scene.checks import check_scene_given
 
 if TYPE_CHECKING:
     import pycolmap
@@ -307,6 +308,7 @@ def write_colmap(
         If an image name has white space in a text model, or a camera model is unknown to COLMAP. The BAL model is
         written as RADIAL, its centre at half the image size.
     """
+    check_scene_given(scene)
     check_colmap(scene, form)
     reconstruction = to_pycolmap(scene)
     with atomic_output(path, force) as draft:

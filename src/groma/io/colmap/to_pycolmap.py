@@ -115,18 +115,17 @@ def _add_points(pycolmap: Any, reconstruction: pycolmap.Reconstruction, scene: S
     order = np.lexsort((keypoint_idx, seen.image_idx, seen.point_idx))
     ends = np.searchsorted(seen.point_idx[order], np.arange(len(points) + 1)).tolist()
     image_ids = scene.images.ids[seen.image_idx[order]].tolist()
-    keypoints = keypoint_idx[order].tolist()
-    images = {number: reconstruction.image(number) for number in scene.images.ids.tolist()}
-    numbers = points.ids.tolist()
-    for row, number in enumerate(numbers):
-        span = range(ends[row], ends[row + 1])
-        elements = [pycolmap.TrackElement(image_ids[k], keypoints[k]) for k in span]
-        point = pycolmap.Point3D(
-            xyz=points.xyz[row], color=points.color[row], error=points.error[row], track=pycolmap.Track(elements)
-        )
+    elements = list(map(pycolmap.TrackElement, image_ids, keypoint_idx[order].tolist()))
+    columns = points.ids.tolist(), points.xyz, points.color, points.error.tolist(), pairwise(ends)
+    for number, xyz, color, error, (begin, end) in zip(*columns, strict=True):
+        point = pycolmap.Point3D()  # its fields as arguments take five times as long
+        point.xyz, point.color, point.error = xyz, color, error
+        point.track = pycolmap.Track(elements[begin:end])
         reconstruction.add_point3D_with_id(number, point)
-        for k in span:
-            images[image_ids[k]].set_point3D_for_point2D(keypoints[k], number)
+    numbers, owners = keypoint_idx.tolist(), points.ids[seen.point_idx].tolist()
+    images = [reconstruction.image(number).set_point3D_for_point2D for number in scene.images.ids.tolist()]
+    for image_idx, number, owner in zip(seen.image_idx.tolist(), numbers, owners, strict=True):
+        images[image_idx](number, owner)
 
 
 def _rigid(pycolmap: Any, pose: FloatArray) -> Any:

@@ -22,6 +22,7 @@ from groma.io.atomic import atomic_output
 from groma.io.drawn import Drawn, drawn, drawn_cameras
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Scene
+from groma.scene.checks import check_scene_given
 
 #: Numbers of AutoCAD's colours: red, green, blue, yellow, magenta, cyan; 7 is black on white and 8 is grey.
 _DIRECTION_COLOURS = (1, 5, 3, 30, 6, 4, 2, 34)
@@ -45,6 +46,7 @@ def write_dxf(scene: Scene, path: str | os.PathLike[str], force: bool = False) -
     force : bool
         Replace an existing file.
     """
+    check_scene_given(scene)
     check_dxf(scene)
     with atomic_output(path, force) as draft, draft.open("w", encoding="ascii", newline="\r\n") as file:
         for code, value in _groups(scene):

@@ -26,6 +26,7 @@ from groma.io.atomic import atomic_output
 from groma.io.drawn import Colours, DrawnCameras, drawn, drawn_cameras, middle_of
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Scene
+from groma.scene.checks import check_scene_given
 from groma.scene.patches import triangle_fans
 from groma.scene.upright import upward
 
@@ -93,6 +94,7 @@ def write_gltf(scene: Scene, path: str | os.PathLike[str], force: bool = False) 
     force : bool
         Replace an existing file.
     """
+    check_scene_given(scene)
     document, as_text = _document(scene), Path(path).suffix.lower() == ".gltf"
     if as_text and document.data:
         inside = "data:application/octet-stream;base64," + base64.b64encode(document.data).decode()

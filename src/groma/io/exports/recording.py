@@ -21,6 +21,7 @@ from groma.io.atomic import atomic_output
 from groma.io.drawn import Drawn, DrawnCameras, drawn, drawn_cameras, middle_of
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Scene
+from groma.scene.checks import check_scene_given
 from groma.scene.patches import triangle_fans
 from groma.scene.upright import upward
 
@@ -51,6 +52,7 @@ def write_recording(scene: Scene, path: str | os.PathLike[str], force: bool = Fa
     InputError
         If rerun is not installed.
     """
+    check_scene_given(scene)
     check_recording(scene)
     rerun: Any = importlib.import_module("rerun")
     shown, images = drawn(scene), drawn_cameras(scene)

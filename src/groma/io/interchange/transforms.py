@@ -55,6 +55,7 @@ from groma.io.pose_conventions import FLIP, TRANSFORMS
 from groma.io.reading import existing, reading
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Cameras, Points, Scene
+from groma.scene.checks import check_scene_given
 
 _NAME = "transforms.json"
 #: What a frame or the top of a file says about a camera.
@@ -232,6 +233,7 @@ def write_transforms(
     InputError
         If a camera has a model that the file does not know, or no size.
     """
+    check_scene_given(scene)
     place = Path(path)
     cameras = [_entries(scene.cameras, row) for row in range(scene.num_cameras)]
     poses = scene.cam_from_world

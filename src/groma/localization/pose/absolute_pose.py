@@ -62,8 +62,8 @@ class PoseOptions:
         return "all" if self.refine_lens else "none"
 
 
-#: Of so many points of a mirror image one is matched first.
-_SOME = 4
+#: Of so many points of a mirror image one is matched first (cost: fewer tell too little where a place repeats).
+_SOME = 2
 #: Focal lengths of phones to telephoto lenses, over the longer side of the image, in steps of a fifth.
 UNKNOWN_LENS = tuple(0.5 * 1.2**step for step in range(10))
 

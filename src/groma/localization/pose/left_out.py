@@ -18,8 +18,8 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.matches import Matches
+from groma.localization.pose.pose_problem import problem_of
 from groma.localization.pose.records import landmark_rows, motions_of_lines, records, times
-from groma.localization.pose.refinement import problem_of
 
 #: A landmark whose information falls below this share in some direction hung on the image that was left out.
 _LEFT = 1e-2

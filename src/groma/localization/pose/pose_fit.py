@@ -15,7 +15,7 @@ import numpy as np
 from groma._numba import loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.factors.losses import Loss, loss_derivatives
-from groma.localization.pose.records import records
+from groma.localization.pose.records import records_at
 from groma.localization.pose.residuals import near_of
 from groma.problem.problem import Problem
 from groma.solver.damped_problem import Trial
@@ -119,7 +119,9 @@ class _PoseProblem:
         focal: IntArray | None,
         tolerance: float,
     ) -> None:
-        self._problem, self._weights, self._near, self._loss, self._focal = problem, weights, near, loss, focal
+        self._problem, self._weights, self._near, self._focal = problem, weights, near, focal
+        self._loss = loss.tag, loss.parameters
+        self._held = {name: group.ambient() for name, group in problem.variables.items()}
         self._tolerance = tolerance
         self._damping = NielsenDamping(_DAMPING)
         moves = {n for n in problem.variables if n == "frames" or (focal is not None and n.startswith("intrinsics"))}
@@ -196,12 +198,13 @@ class _PoseProblem:
     def _evaluated(self, states: dict[str, FloatArray]) -> _PoseTrial:
         """Evaluate costs and products at some states."""
         cost, hidden, total = 0.0, 0, 0.0
-        problem = self._problem.with_states(states)
+        groups = self._problem.variables
+        read = self._held | {name: groups[name].manifold.ambient(state) for name, state in states.items()}
         lens = next((state[0] for name, state in states.items() if name != "frames"), None)
         wanted = {"pose": 6} if lens is None else {"pose": 6, "intrinsics": len(lens)}
-        for factor, weight, near in zip(problem.factors, self._weights, self._near, strict=True):
-            record = records(problem, factor, wanted)
-            own, blind = _weigh(record, weight, near, self._loss.tag, self._loss.parameters)
+        for factor, weight, near in zip(self._problem.factors, self._weights, self._near, strict=True):
+            record = records_at(read, factor, wanted)
+            own, blind = _weigh(record, weight, near, *self._loss)
             rows = record.reshape(-1, record.shape[2])
             if lens is not None:
                 by_focal = rows[:, 6:-1][:, self._focal] @ lens[self._focal]

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
@@ -15,15 +17,23 @@ def landmark_rows(factor: Factor, group: str) -> IntArray | None:
     return next((ref.index for _, ref in factor.references() if ref.group == group), None)
 
 
-def records(problem: Problem, factor: Factor, wanted: dict[str, int]) -> FloatArray:
+def records(problem: Problem, factor: Factor, wanted: Mapping[str, int]) -> FloatArray:
     """Derivatives by slots of so many coordinates, side by side, and the residual in the last column; not whitened."""
+    return records_at(
+        {ref.group: problem.variables[ref.group].ambient() for _, ref in factor.references()}, factor, wanted
+    )
+
+
+def records_at(ambients: Mapping[str, FloatArray], factor: Factor, wanted: Mapping[str, int]) -> FloatArray:
+    """Return :func:`records` where what factors read of each group of variables is known."""
     begin, place = {}, 0
     for slot, size in wanted.items():
         begin[slot], place = place, place + size
-    columns = tuple(begin.get(own.name, -1) for own, _ in factor.references())
-    ambients = tuple(problem.variables[ref.group].ambient() for _, ref in factor.references())
+    references = factor.references()
+    columns = tuple(begin.get(own.name, -1) for own, _ in references)
     record = np.zeros((len(factor), factor.residual_size, place + 1))
-    factor.linearize(factor.prepare(ambients), 0, len(factor), columns, record)
+    inputs = factor.prepare(tuple(ambients[ref.group] for _, ref in references))
+    factor.linearize(inputs, 0, len(factor), columns, record)
     return record
 
 

@@ -28,7 +28,7 @@ Reference: K.-Y. Liang, S. Zeger, *Longitudinal data analysis using generalized 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
@@ -36,8 +36,6 @@ import numpy as np
 
 from groma._numba import loop
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.adjustment.assemble import assemble
-from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.stages import with_loss
 from groma.factors.contract import Factor
 from groma.factors.losses import Cauchy, GemanMcClure
@@ -47,16 +45,13 @@ from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.gates import REFINEMENT, RefinementGates
 from groma.localization.pose.matches import Matches, nearest_claims
 from groma.localization.pose.pose_fit import FINELY, ROUGHLY, fit_pose
+from groma.localization.pose.pose_problem import problem_of
 from groma.localization.pose.records import landmark_rows, records, times
 from groma.localization.pose.residuals import Residuals, residual_squares_of, residuals, weighted_near
 from groma.problem.problem import Problem
-from groma.scene import LineObservations, Lines, PointObservations, Points, Scene
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 
-_ASSEMBLY = AssemblyOptions(
-    point_chart="euclidean", drop_behind=False, require_in_front=True, gauge="free", refine_landmarks=False
-)
 #: Information of scaled unknowns below which they are not determined.
 _SINGULAR = 1e-10
 _LENS = SolverOptions(max_iterations=30, function_tolerance=1e-6, threads=1)
@@ -327,23 +322,6 @@ def _lens_directions(camera: QueryCamera, lens: LensUnknowns) -> FloatArray | No
     if lens == "focal":
         return np.where(np.isin(np.arange(len(camera.params)), focal), camera.params, 0.0)[:, None]
     return np.eye(len(camera.params))[:, sorted((*focal, *camera.kind.extra_indices))]
-
-
-def problem_of(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_lens: bool = False) -> Problem:
-    """The problem of one pose, with the noise of the image alone."""
-    image = np.zeros(matches.num_points, np.int64), np.zeros(matches.num_lines, np.int64)
-    scene = Scene.from_images(
-        camera.table(), ["query"], [0], pose[None],
-        points=Points.at(matches.points3d),
-        point_observations=PointObservations.numbered(
-            image[0], np.arange(matches.num_points), matches.points2d, matches.point_sigma
-        ),
-        lines=Lines.through(matches.segments3d),
-        line_observations=LineObservations(
-            image[1], np.arange(matches.num_lines), matches.segments2d.reshape(-1, 4), matches.segment_sigma
-        ),
-    )  # fmt: skip
-    return assemble(scene, replace(_ASSEMBLY, refine_intrinsics=refine_lens)).problem
 
 
 def landmark_weights(problem: Problem, matches: Matches) -> list[FloatArray]:

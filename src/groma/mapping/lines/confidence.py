@@ -24,7 +24,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import erf, expit
+import scipy  # its parts are imported when something of them is first used
 
 from groma._typing import BoolArray, FloatArray
 from groma.cameras import model as camera_model
@@ -73,15 +73,16 @@ def with_confidence(scene: Scene) -> Scene:
 def line_confidence(scene: Scene) -> FloatArray:
     """Return the probability (L,) that each line is right."""
     noise = line_noise(scene)
-    return expit(line_evidence(scene, noise) @ np.array(list(WEIGHTS.values()))) * line_accuracy(scene, noise)
+    right = scipy.special.expit(line_evidence(scene, noise) @ np.array(list(WEIGHTS.values())))
+    return right * line_accuracy(scene, noise)
 
 
 def line_accuracy(scene: Scene, noise: LineNoise | None = None, gates: ConfidenceGates = GATES) -> FloatArray:
     """Return the probability (L,) that each line lies along its edge, given that there is one; ``noise`` if known."""
     noise = line_noise(scene) if noise is None else noise
     deviation = _deviation(noise) * np.maximum(noise.misfit, 1.0) / usual_distance(scene)
-    within = erf(gates.tolerance / (math.sqrt(2.0) * deviation))
-    return within * erf(gates.edge_px / (math.sqrt(2.0) * _residual_px(scene, noise)))
+    within = scipy.special.erf(gates.tolerance / (math.sqrt(2.0) * deviation))
+    return within * scipy.special.erf(gates.edge_px / (math.sqrt(2.0) * _residual_px(scene, noise)))
 
 
 def line_evidence(scene: Scene, noise: LineNoise | None = None) -> FloatArray:

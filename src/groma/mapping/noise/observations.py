@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.special import polygamma
+import scipy  # its parts are imported when something of them is first used
 
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import AssemblyOptions, assemble
@@ -193,10 +193,10 @@ def _degrees_of_freedom(levels: FloatArray, owner: IntArray, number: IntArray) -
     mean = np.bincount(owner, levels, len(number)) / np.maximum(number, 1)
     within = float(((levels - mean[owner]) ** 2).sum() / (number[points] - 1).sum())
     between = float(np.var(mean[points]) - within * np.mean(1.0 / number[points]))
-    return 2.0 * _inverse_trigamma(between), 2.0 * _inverse_trigamma(within - float(polygamma(1, 1.0)))
+    return 2.0 * _inverse_trigamma(between), 2.0 * _inverse_trigamma(within - float(scipy.special.polygamma(1, 1.0)))
 
 
 def _inverse_trigamma(value: float) -> float:
     """Where the trigamma function, which falls, has a value; the nearer end where that is out of bounds."""
     shapes = np.geomspace(*_SHAPES, 1000)[::-1]
-    return float(np.interp(value, polygamma(1, shapes), shapes))
+    return float(np.interp(value, scipy.special.polygamma(1, shapes), shapes))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.errors import InputError
 from groma.geometry import quaternion
 from groma.scene.camera import Cameras
 from groma.scene.landmarks import Lines, Planes, Points
@@ -44,10 +45,18 @@ class Structure:
     trims: FloatArray | None = None
 
 
+def check_deviations(**deviations: float) -> None:
+    """Raise InputError if a standard deviation is negative or not finite."""
+    for name, value in deviations.items():
+        if not 0.0 <= value < float("inf"):
+            raise InputError(f"{name} must be a standard deviation, 0 or more; got {value}.")
+
+
 def assemble(
     rng: np.random.Generator, camera: Cameras, poses: FloatArray, structure: Structure, noise_px: float
 ) -> Scene:
     """Return the true scene with measurements of a standard deviation in pixels; poses (N, 7) of one PINHOLE camera."""
+    check_deviations(noise_px=noise_px)
     point_obs, line_obs, segments = structure.point_obs, structure.line_obs, structure.segments
     point_obs = point_obs[np.lexsort((point_obs[:, 1], point_obs[:, 0]))]
     order = np.lexsort((line_obs[:, 1], line_obs[:, 0]))

@@ -19,7 +19,7 @@ from groma.scene.camera import Cameras
 from groma.scene.landmarks import Lines
 from groma.scene.observations import Relations
 from groma.scene.synthetic.corridor import corridor
-from groma.scene.synthetic.noise import Structure, SyntheticScene, assemble, rotated
+from groma.scene.synthetic.noise import Structure, SyntheticScene, assemble, check_deviations, rotated
 
 WIDTH, HEIGHT, FOCAL = 1024, 768, 800.0
 #: Half extent of the cube, radius of the camera sphere, least depth of anything observed.
@@ -77,6 +77,7 @@ def holistic(
         raise InputError(f"num_images must be at least 2; got {num_images}.")
     if views not in ("random", "near"):
         raise InputError(f"views must be 'random' or 'near'; got {views!r}.")
+    check_deviations(rotation_deg=rotation_deg, translation=translation, structure=structure)
     rng = np.random.default_rng([seed, num_images])
     poses = _sphere_of_cameras(rng, num_images)
     choose = _ViewChoice(rng, poses, views)

@@ -23,6 +23,7 @@ from groma.localization.pose.refinement import refine
 from groma.mapping.noise.landmarks import point_noise
 from groma.tracking.backend.loop_closure import agreeing_pose, join_lines
 from groma.tracking.frame.camera import TrackCamera, into, rotation
+from groma.tracking.frame.descriptor_pairs import PlacedFeatures
 from groma.tracking.frame.measurements import PointMeasurements
 from groma.tracking.gates import TrackingGates
 from groma.tracking.map.landmarks import ALIVE
@@ -139,10 +140,11 @@ def _refined(
     gates, query, features = options.gates, older.camera.query, newest.features
     point = np.array([known.keyframes[k].features.point[row] for k, row in zip(known.of, known.row, strict=True)])
     mapped = (point >= 0) & np.isfinite(older.covariance[point, 0, 0])
+    placed = PlacedFeatures.of(features.pixel, features.descriptor)
     matches, found, pairs = Matches(), None, np.zeros((0, 2), np.int64)
     for factor in gates.finding.rounds:
         reach = factor * gates.finding.near
-        pairs = match_near(older.camera, known, features, pose, reach)
+        pairs = match_near(older.camera, known, placed, pose, reach)
         pairs = pairs[mapped[pairs[:, 0]]]
         if len(pairs) < gates.loops.min_inliers:
             return None

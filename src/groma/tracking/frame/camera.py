@@ -7,20 +7,56 @@ corner of the image (first pixel's centre at 0.5, 0.5); OpenCV's do not, and are
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from groma._numba import loop
 from groma._typing import BoolArray, FloatArray
 from groma.cameras import model as camera_model
 from groma.errors import InputError
-from groma.geometry import quaternion
 from groma.io.sequences.frame import SequenceCamera
 from groma.localization.pose.camera import QueryCamera
 
 #: Nothing nearer than this share of the focal plane's unit depth is projected, scene units.
 NEAR = 1e-3
 PINHOLE = "PINHOLE"
+
+
+@loop
+def _clip_segments(ends_in_cam, K, size, limits, ends, seen):
+    """Write segments (L, 2, 3) in pixels, cut to what is in front of ``near`` and inside a border; which are seen."""
+    near, border = limits
+    P, start, way = np.empty((2, 3)), np.empty(2), np.empty(2)
+    for i in range(ends_in_cam.shape[0]):
+        P[:] = ends_in_cam[i]
+        if not (P[0, 2] > near or P[1, 2] > near):
+            continue
+        for one in range(2):
+            if P[one, 2] < near:
+                share = (near - P[one, 2]) / (P[1 - one, 2] - P[one, 2])
+                for k in range(2):
+                    P[one, k] += share * (P[1 - one, k] - P[one, k])
+                P[one, 2] = near
+        low, high, outside = 0.0, 1.0, False
+        for axis in range(2):
+            start[axis] = P[0, axis] / P[0, 2] * K[axis] + K[2 + axis]
+            way[axis] = P[1, axis] / P[1, 2] * K[axis] + K[2 + axis] - start[axis]
+            for sign in (1.0, -1.0):
+                side = border if sign > 0.0 else size[axis] - border
+                distance, speed = sign * (start[axis] - side), sign * way[axis]
+                if speed > 0.0:
+                    low = max(low, -distance / speed)
+                elif speed < 0.0:
+                    high = min(high, -distance / speed)
+                elif not distance >= 0.0:
+                    outside = True
+        if not outside and high > low:
+            seen[i] = True
+            for axis in range(2):
+                ends[i, axis], ends[i, 2 + axis] = start[axis] + low * way[axis], start[axis] + high * way[axis]
 
 
 @dataclass(frozen=True)
@@ -65,6 +101,11 @@ class TrackCamera:
         return np.array([[self.fx, 0, self.cx - 0.5], [0, self.fy, self.cy - 0.5], [0, 0, 1.0]])
 
     @property
+    def pinhole(self) -> dict[str, Any]:
+        """The same camera, as PoseLib wants it."""
+        return {"model": PINHOLE, "width": self.width, "height": self.height, "params": self.params.tolist()}
+
+    @property
     def query(self) -> QueryCamera:
         """The same camera, for :func:`groma.estimate_absolute_pose`."""
         return QueryCamera(PINHOLE, self.params, self.width, self.height)
@@ -93,39 +134,35 @@ class TrackCamera:
 
         Returns (L, 4) pixels, and which of them are seen at all.
         """
-        first, second = ends_in_cam[:, 0].copy(), ends_in_cam[:, 1].copy()
         near = max(NEAR, 0.02 * float(np.median(np.abs(ends_in_cam[..., 2])))) if len(ends_in_cam) else NEAR
-        seen = (first[:, 2] > near) | (second[:, 2] > near)
-        for one, other in ((first, second), (second, first)):
-            behind = seen & (one[:, 2] < near)
-            share = (near - one[behind, 2]) / (other[behind, 2] - one[behind, 2])
-            one[behind] += share[:, None] * (other[behind] - one[behind])
-        first[~seen], second[~seen] = (0, 0, 1), (0, 0, 1)
-        start, end = self.project(first), self.project(second)
-        low, high = np.zeros(len(start)), np.ones(len(start))
-        way = end - start
-        with np.errstate(divide="ignore", invalid="ignore"):
-            for axis, size in ((0, self.width), (1, self.height)):
-                for side, sign in ((border, 1.0), (size - border, -1.0)):
-                    distance, speed = sign * (start[:, axis] - side), sign * way[:, axis]
-                    share = -distance / speed
-                    low = np.where(speed > 0, np.maximum(low, share), low)
-                    high = np.where(speed < 0, np.minimum(high, share), high)
-                    seen &= (speed != 0) | (distance >= 0)
-        seen &= high > low
-        ends = np.hstack([start + low[:, None] * way, start + high[:, None] * way])
-        ends[~seen] = 0.0
+        ends, seen = np.zeros((len(ends_in_cam), 4)), np.zeros(len(ends_in_cam), dtype=bool)
+        size = float(self.width), float(self.height)
+        _clip_segments(np.ascontiguousarray(ends_in_cam), self.params, size, (near, float(border)), ends, seen)
         return ends, seen
 
 
 def rotation(pose: FloatArray) -> FloatArray:
     """(3, 3) rotation matrix of one pose (7,)."""
-    return quaternion.to_matrix(pose[:4])
+    x, y, z, w = pose[:4].tolist()  # numbers of Python are quicker here than arrays of one
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
 
 
 def into(pose: FloatArray, points: FloatArray) -> FloatArray:
     """Move points (..., 3) by one pose (7,)."""
     return points @ rotation(pose).T + pose[4:]
+
+
+def apart(pose: FloatArray, other: FloatArray) -> tuple[float, float]:
+    """Distance between the centres of two cameras (7,), and the angle between them."""
+    first, second = rotation(pose), rotation(other)
+    shift = math.dist(pose[4:] @ first, other[4:] @ second)
+    turn = first @ second.T
+    across = math.hypot(turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1])
+    return shift, math.atan2(across, float(np.trace(turn)) - 1.0)
 
 
 def back(pose: FloatArray, points: FloatArray) -> FloatArray:

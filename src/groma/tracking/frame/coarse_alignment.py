@@ -17,11 +17,14 @@ import numpy.typing as npt
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
+from groma.estimators.batch_least_squares import solve_damped
 from groma.geometry import quaternion, se3, so3
+from groma.geometry.so3 import exp_kernel
 from groma.tracking.frame.camera import TrackCamera, into, rotation
 from groma.tracking.gates import DEFAULT, TurnGates
 
-_SmallImage = npt.NDArray[np.float32]
+SmallImage = npt.NDArray[np.float32]
+_THREE = (None,) * 3
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -109,6 +112,34 @@ def _compare(before, now, K, turn, outlier, H, gradient):
 
 
 @loop
+def _turn_until_best(before, now, K, limits, steps, best):
+    """Improve a rotation by Gauss-Newton; return the correlation of the images at the best one."""
+    outlier, min_overlap, converged = limits
+    turn, after, by = best.copy(), np.empty((3, 3)), np.empty(9)
+    H, gradient, L, omega = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
+    best_score = -np.inf
+    for _ in range(steps):
+        share, score = _compare(before, now, K, turn, outlier, H, gradient)
+        if share < min_overlap:
+            break
+        if score > best_score:
+            best[:], best_score = turn, score
+        little = 1e-6 * (H[0, 0] + H[1, 1] + H[2, 2] + 1.0)
+        for k in range(3):
+            H[k, k] += little
+        if not solve_damped(H, -gradient, 0.0, L, omega, _THREE):
+            break
+        exp_kernel(omega[0], omega[1], omega[2], by)
+        for i in range(3):
+            for j in range(3):
+                after[i, j] = by[3 * i] * turn[0, j] + by[3 * i + 1] * turn[1, j] + by[3 * i + 2] * turn[2, j]
+        turn[:] = after
+        if max(abs(omega[0]), abs(omega[1]), abs(omega[2])) * K[0, 0] < converged:
+            break
+    return best_score
+
+
+@loop
 def _correlate(before, now, first, second, noise, each):
     """Write the correlation of the 5 x 5 surroundings of places in both images; return that of all together."""
     height, width = before.shape
@@ -134,7 +165,7 @@ def _correlate(before, now, first, second, noise, each):
 # ------------------------------------------------------------------------------------------------------------- Public
 
 
-def small_image(gray: npt.NDArray[np.uint8], gates: TurnGates = DEFAULT.turns) -> _SmallImage:
+def small_image(gray: npt.NDArray[np.uint8], gates: TurnGates = DEFAULT.turns) -> SmallImage:
     """Return a small, blurred image."""
     height, width = gray.shape
     size = (gates.width, max(round(gates.width * height / width), 8))
@@ -144,8 +175,8 @@ def small_image(gray: npt.NDArray[np.uint8], gates: TurnGates = DEFAULT.turns) -
 
 def turn_between(
     camera: TrackCamera,
-    before: _SmallImage,
-    now: _SmallImage,
+    before: SmallImage,
+    now: SmallImage,
     starts: list[FloatArray],
     gates: TurnGates = DEFAULT.turns,
 ) -> FloatArray:
@@ -181,7 +212,7 @@ def _matrix(camera: TrackCamera, shape: tuple[int, ...]) -> FloatArray:
     return K
 
 
-def _shift(before: _SmallImage, now: _SmallImage) -> FloatArray:
+def _shift(before: SmallImage, now: SmallImage) -> FloatArray:
     """Shift (2,) of the middle of the first image in the second, pixels, by correlation."""
     height, width = before.shape
     top, left = height // 4, width // 4
@@ -191,30 +222,20 @@ def _shift(before: _SmallImage, now: _SmallImage) -> FloatArray:
 
 
 def _align(
-    K: FloatArray, before: _SmallImage, now: _SmallImage, start: FloatArray, gates: TurnGates, steps: int
+    K: FloatArray, before: SmallImage, now: SmallImage, start: FloatArray, gates: TurnGates, steps: int
 ) -> tuple[FloatArray, float]:
     """Gauss-Newton on the rotation; return the best one with the correlation of the images where they overlap.
 
     One step tells how well they agree at the start.
     """
-    turn, best, best_score = start, start, -np.inf
-    H, gradient = np.zeros((3, 3)), np.zeros(3)
-    for _ in range(steps):
-        share, score = _compare(before, now, K, turn, gates.outlier, H, gradient)
-        if share < gates.min_overlap:
-            break
-        if score > best_score:
-            best, best_score = turn, score
-        omega = -np.linalg.solve(H + 1e-6 * (np.trace(H) + 1.0) * np.eye(3), gradient)
-        turn = so3.exp(omega[None])[0] @ turn
-        if np.abs(omega).max() * K[0, 0] < gates.converged:
-            break
-    return best, best_score
+    best = np.array(start, dtype=np.float64)
+    limits = float(gates.outlier), float(gates.min_overlap), float(gates.converged)
+    return best, _turn_until_best(before, now, K, limits, steps, best)
 
 
 def surroundings_agree(
-    before: _SmallImage,
-    now: _SmallImage,
+    before: SmallImage,
+    now: SmallImage,
     shape: tuple[int, int],
     pixels: FloatArray,
     guesses: FloatArray,
@@ -255,8 +276,8 @@ def _after(turn: FloatArray, pose: FloatArray) -> FloatArray:
 
 def turned_prediction(
     camera: TrackCamera,
-    before: npt.NDArray[np.uint8],
-    now: npt.NDArray[np.uint8],
+    before: SmallImage,
+    now: SmallImage,
     followed: tuple[FloatArray, FloatArray],
     spread: Callable[[], tuple[FloatArray, FloatArray]],
     previous: FloatArray,
@@ -269,8 +290,8 @@ def turned_prediction(
     ----------
     camera
         The camera.
-    before, now : (H, W) uint8
-        The frame before, whose pose is known, and the present one.
+    before, now
+        From :func:`small_image`: the frame before, whose pose is known, and the present one.
     followed : (n, 2), (n, 3)
         Pixels of followed points in the frame before, and where they are in the world: these ask for a turn.
     spread : callable
@@ -281,11 +302,11 @@ def turned_prediction(
     gates
         What counts as agreement.
     """
-    small = small_image(before, gates), small_image(now, gates)
+    shape = camera.height, camera.width
 
     def agree(pose: FloatArray, pixels: FloatArray, places: FloatArray) -> tuple[float, float]:
         moved = pixels + camera.project(into(pose, places)) - camera.project(into(previous, places))
-        return surroundings_agree(*small, now.shape, pixels, np.where(np.isfinite(moved), moved, -1e6), gates.noise)
+        return surroundings_agree(before, now, shape, pixels, np.where(np.isfinite(moved), moved, -1e6), gates.noise)
 
     if len(followed[0]) >= gates.min_places and agree(predicted, *followed)[0] > gates.agrees:
         return None
@@ -296,7 +317,7 @@ def turned_prediction(
     turns = [rotation(predicted) @ rotation(previous).T, np.eye(3)]
     # The same turn, with the way that was predicted or without any.
     center = se3.inverse(predicted[None])[0, 4:]
-    stayed = _after(turn_between(camera, *small, turns, gates), previous)
+    stayed = _after(turn_between(camera, before, now, turns, gates), previous)
     went = stayed.copy()
     went[4:] = -rotation(stayed) @ center
     scores = [agree(pose, *every)[1] for pose in (stayed, went)]

@@ -6,10 +6,15 @@ In come binary descriptors of both, and places; out come pairs that are most ali
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray, IntArray
+
+#: Height of the bands that features are sorted into, pixels (cost: features that are looked at).
+BAND = 16.0
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
 
@@ -24,30 +29,46 @@ def _count_bits(x):
 
 
 @loop
-def _best_near(expected, first, pixel, second, radius, max_bits, partner, bits, distance):
+def _best_near(expected, first, pixel, second, order, begin, band, radius, max_bits, partner, bits, distance):
     """Write the best partner of each of both sides, or -1, with its bits and squared distance.
 
-    The rows of ``pixel`` are in order of v. ``partner``, ``bits`` and ``distance`` are of first and second, one after
-    the other.
+    The rows of ``pixel`` and ``second`` are sorted into bands of the image, each in order of u; band k begins at
+    ``begin[k]``. ``order`` has their numbers, which ``partner`` is about; of rows that are as good the least counts.
+    ``partner``, ``bits`` and ``distance`` are of first and second, one after the other.
     """
-    count, words = expected.shape[0], first.shape[1]
-    rows = np.ascontiguousarray(pixel[:, 1])
+    count, words, bands = expected.shape[0], first.shape[1], begin.shape[0] - 1
     for i in range(count):
         u, v = expected[i, 0], expected[i, 1]
-        for j in range(np.searchsorted(rows, v - radius), rows.shape[0]):
-            if rows[j] > v + radius:
-                break
-            apart = (pixel[j, 0] - u) ** 2 + (rows[j] - v) ** 2
-            if apart > radius * radius:
-                continue
-            differ = np.int64(0)
-            for k in range(words):
-                differ += _count_bits(first[i, k] ^ second[j, k])
-            if differ > max_bits:
-                continue
-            for one, other in ((i, j), (count + j, i)):
-                if partner[one] < 0 or differ < bits[one] or (differ == bits[one] and apart < distance[one]):
-                    partner[one], bits[one], distance[one] = other, differ, apart
+        if not (v + radius >= 0.0 and v - radius < bands * band and abs(u) < np.inf):
+            continue
+        for k in range(max(int((v - radius) / band), 0), min(int((v + radius) / band) + 1, bands)):
+            low, high = begin[k], begin[k + 1]
+            while low < high:
+                middle = (low + high) // 2
+                if pixel[middle, 0] < u - radius:
+                    low = middle + 1
+                else:
+                    high = middle
+            for j in range(low, begin[k + 1]):
+                if pixel[j, 0] > u + radius:
+                    break
+                apart = (pixel[j, 0] - u) ** 2 + (pixel[j, 1] - v) ** 2
+                if apart > radius * radius:
+                    continue
+                differ = np.int64(0)
+                for word in range(words):
+                    differ += _count_bits(first[i, word] ^ second[j, word])
+                    if differ > max_bits:
+                        break
+                if differ > max_bits:
+                    continue
+                number = order[j]
+                for one, other in ((i, number), (count + number, i)):
+                    best = partner[one]
+                    if best >= 0 and (differ > bits[one] or (differ == bits[one] and apart > distance[one])):
+                        continue
+                    if best < 0 or differ < bits[one] or apart < distance[one] or other < best:
+                        partner[one], bits[one], distance[one] = other, differ, apart
 
 
 @loop
@@ -104,23 +125,38 @@ def pair_anywhere(first: np.ndarray, second: np.ndarray, max_bits: int) -> tuple
     return rows, partner[rows]
 
 
+@dataclass(frozen=True)
+class PlacedFeatures:
+    """Described features of an image, sorted by their places: in bands, and from left to right in each."""
+
+    #: (m, 2) pixels, (m, 4) words of descriptors, (m,) their numbers, (bands + 1,) where each band begins.
+    pixel: FloatArray
+    words: np.ndarray
+    number: IntArray
+    begin: IntArray
+
+    @classmethod
+    def of(cls, pixel: FloatArray, descriptor: np.ndarray) -> PlacedFeatures:
+        """Sort features: pixels (m, 2), not negative, and descriptors (m, 32) uint8."""
+        band = (pixel[:, 1] / BAND).astype(np.int64)
+        order = np.lexsort((pixel[:, 0], band))
+        begin = np.searchsorted(band[order], np.arange(band.max(initial=-1) + 2))
+        words = np.ascontiguousarray(descriptor[order]).view(np.uint64)
+        return cls(np.ascontiguousarray(pixel[order]), words, order, begin)
+
+
 def pair_near(
-    expected: FloatArray,
-    first: np.ndarray,
-    pixel: FloatArray,
-    second: np.ndarray,
-    radius: float,
-    max_bits: int,
+    expected: FloatArray, descriptor: np.ndarray, features: PlacedFeatures, radius: float, max_bits: int
 ) -> IntArray:
     """Pair features with others near where they are expected: the most alike for both, the nearest among equals.
 
     Parameters
     ----------
     expected : (n, 2)
-        Where features are expected, pixels; finite.
-    first : (n, 32) uint8
+        Where features are expected, pixels; NaN where nowhere.
+    descriptor : (n, 32) uint8
         Their descriptors.
-    pixel, second : (m, 2), (m, 32) uint8
+    features
         The others.
     radius : float
         Largest distance, pixels.
@@ -132,15 +168,13 @@ def pair_near(
     (k, 2) int
         Rows of the pairs, the most alike first.
     """
-    n, m = len(expected), len(pixel)
-    order = np.argsort(pixel[:, 1], kind="stable")
+    n, m = len(expected), len(features.number)
     partner, bits, distance = np.full(n + m, -1), np.zeros(n + m, np.int64), np.zeros(n + m)
-    words = [np.ascontiguousarray(table).view(np.uint64) for table in (first, second[order])]
     _best_near(
-        np.ascontiguousarray(expected), words[0], np.ascontiguousarray(pixel[order]), words[1],
-        float(radius), int(max_bits), partner, bits, distance,
+        np.ascontiguousarray(expected), np.ascontiguousarray(descriptor).view(np.uint64), features.pixel,
+        features.words, features.number, features.begin, BAND, float(radius), int(max_bits), partner, bits, distance,
     )  # fmt: skip
     rows = np.flatnonzero(partner[:n] >= 0)
     rows = rows[partner[n + partner[rows]] == rows]
     rows = rows[np.lexsort((distance[rows], bits[rows]))]
-    return np.column_stack([rows, order[partner[rows]]])
+    return np.column_stack([rows, partner[rows]])

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, replace
+from functools import cache
 from threading import RLock
 from typing import Any, Generic, TypeVar, overload
 
@@ -22,6 +23,7 @@ from groma.features.point_tracks import corners
 from groma.features.segments import Segments
 from groma.io.sequences.frame import Frame
 from groma.tracking.frame.camera import TrackCamera, back
+from groma.tracking.frame.coarse_alignment import SmallImage, small_image
 from groma.tracking.frame.depth import DepthImage, depth_sigma, segment_inverse_depths
 from groma.tracking.frame.planes import FramePlanes, frame_planes
 from groma.tracking.frame.rectification import (
@@ -154,7 +156,8 @@ class FrameFeatures:
         """Begin in other threads with what depends on this image alone; with what a search needs where one is given."""
         if self.frame.right is not None:  # how that camera is turned may become known better meanwhile
             return
-        pool.submit(getattr, self, "planes")
+        for name in ("planes", "small"):
+            pool.submit(getattr, self, name)
         if searching is not None:
             self.prepare(searching)
 
@@ -164,6 +167,11 @@ class FrameFeatures:
             if not future.cancel():
                 future.result()
         self._work.clear()
+
+    @_FoundOnce
+    def small(self) -> SmallImage:
+        """A small image, which tells how the camera turned."""
+        return small_image(self.gray, self.options.gates.turns)
 
     @_FoundOnce
     def planes(self) -> FramePlanes | None:
@@ -294,11 +302,14 @@ def segment_noise(gates: DepthGates = DEFAULT.depth) -> DepthNoise:
     return DepthNoise(gates.min_sigma, gates.inverse_sigma, 0.0, correlation=gates.correlation, tilt=0.0, shift=0.0)
 
 
+@cache
 def grid_pixels(camera: TrackCamera, gates: DepthGates = DEFAULT.depth) -> FloatArray:
-    """Pixels (N, 2) of an even grid over the image, row by row: the middles of cells."""
+    """Pixels (N, 2) of an even grid over the image, row by row: the middles of cells. It cannot be written to."""
     rows, columns = grid_shape(camera, gates)
     v, u = np.mgrid[0:rows, 0:columns].reshape(2, -1)
-    return (np.column_stack([u, v]) + 0.5) * (camera.width / columns, camera.height / rows)
+    pixels = (np.column_stack([u, v]) + 0.5) * (camera.width / columns, camera.height / rows)
+    pixels.flags.writeable = False
+    return pixels
 
 
 def grid_shape(camera: TrackCamera, gates: DepthGates = DEFAULT.depth) -> tuple[int, int]:

@@ -8,7 +8,7 @@ problems: the pose of one frame, a window, the whole map.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Self
 
 import numpy as np
@@ -22,11 +22,11 @@ DEPTH_BASELINE = 0.6
 @dataclass(frozen=True)
 class _Rows(ABC):
     def __len__(self) -> int:
-        return len(getattr(self, fields(self)[0].name))
+        return len(next(iter(vars(self).values())))
 
     def take(self, rows: IntArray | BoolArray) -> Self:
         """Return some rows."""
-        return replace(self, **{item.name: getattr(self, item.name)[rows] for item in fields(self)})
+        return type(self)(*[column[rows] for column in vars(self).values()])
 
     @classmethod
     def stack(cls, tables: list[Self]) -> Self:

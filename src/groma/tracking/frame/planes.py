@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -33,6 +34,19 @@ class FramePlanes:
 
     def __len__(self) -> int:
         return len(self.plane)
+
+    @cached_property
+    def means(self) -> FloatArray:
+        """(K, 3) mean places of the planes."""
+        count = np.bincount(self.place_plane, minlength=len(self))
+        sums = [np.bincount(self.place_plane, self.places[:, k], len(self)) for k in range(3)]
+        return np.stack([each / np.maximum(count, 1) for each in sums], axis=1)
+
+    @cached_property
+    def place_rows(self) -> tuple[IntArray, IntArray]:
+        """Rows of the places, plane by plane, and (K + 1,) where those of each begin."""
+        rows = np.argsort(self.place_plane, kind="stable")
+        return rows, np.searchsorted(self.place_plane[rows], np.arange(len(self) + 1))
 
     def places_of(self, row: int) -> FloatArray:
         """Places (c, 3) on one plane."""

@@ -231,7 +231,6 @@ def _add_lines(track_map, camera, data, pose, followed: FollowedSegments, index:
     rows = np.flatnonzero(of_segment >= 0)
     known = of_segment[rows]
     _place_pending_lines(track_map, camera, pose, known, segments.ends[rows], detected, rows, index, gates)
-    lines.found[known] += 1
     lines.strength[known] = segments.strength[rows]
     _extend_lines(track_map, camera, pose, known, segments.ends[rows], gates.max_extension)
     sigma = np.maximum(segments.sigma[rows], gates.min_sigma)

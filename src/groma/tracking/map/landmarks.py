@@ -21,21 +21,22 @@ class _Growing:
     """Arrays of one length that double when they are full."""
 
     _columns: dict[str, tuple[tuple[int, ...], type, float]]
+    state: np.ndarray
 
     def __init__(self) -> None:
         self.count = 0
         self._arrays = {
             name: np.full((64, *shape), fill, dtype) for name, (shape, dtype, fill) in self._columns.items()
         }
+        self._show_rows()
 
     def __len__(self) -> int:
         return self.count
 
-    def __getattr__(self, name: str) -> np.ndarray:
-        arrays = self.__dict__.get("_arrays", {})
-        if name in arrays:
-            return arrays[name][: self.count]
-        raise AttributeError(name)
+    def _show_rows(self) -> None:
+        """Make the rows in use the attributes that are named as the columns."""
+        for name, array in self._arrays.items():
+            setattr(self, name, array[: self.count])
 
     def extend(self, count: int) -> IntArray:
         """Add ``count`` rows and return their indices."""
@@ -48,12 +49,14 @@ class _Growing:
                 self._arrays[name] = larger
         rows = np.arange(self.count, need)
         self.count = need
+        self._show_rows()
         return rows
 
     def copy(self) -> Self:
         """Return a table of its own with the same rows."""
         out = type(self)()
         out.count, out._arrays = self.count, {name: array.copy() for name, array in self._arrays.items()}
+        out._show_rows()
         return out
 
     @property
@@ -63,7 +66,7 @@ class _Growing:
 
 
 class PointTable(_Growing):
-    """Points: place, where their patch is kept, how often they were looked for and found, and the plane they lie on."""
+    """Points: place, where their patch is kept, how often they were missed, and the plane they lie on."""
 
     _columns = {  # noqa: RUF012
         "xyz": ((3,), np.float64, 0.0),
@@ -72,8 +75,6 @@ class PointTable(_Growing):
         "pixel": ((2,), np.float64, 0.0),
         "first_keyframe": ((), np.int64, -1),
         "first_pixel": ((2,), np.float64, 0.0),
-        "visible": ((), np.int32, 0),
-        "found": ((), np.int32, 0),
         "misses": ((), np.int32, 0),
         "plane": ((), np.int64, -1),
         "plane_sigma": ((), np.float64, 0.0),
@@ -84,8 +85,6 @@ class PointTable(_Growing):
     pixel: FloatArray
     first_keyframe: IntArray
     first_pixel: FloatArray
-    visible: IntArray
-    found: IntArray
     misses: IntArray
     plane: IntArray
     plane_sigma: FloatArray
@@ -101,8 +100,6 @@ class LineTable(_Growing):
         "strength": ((), np.float64, 0.0),
         "first_keyframe": ((), np.int64, -1),
         "first_ends": ((4,), np.float64, 0.0),
-        "visible": ((), np.int32, 0),
-        "found": ((), np.int32, 0),
         "plane": ((), np.int64, -1),
         "plane_sigma": ((), np.float64, 0.0),
     }
@@ -112,8 +109,6 @@ class LineTable(_Growing):
     strength: FloatArray
     first_keyframe: IntArray
     first_ends: FloatArray
-    visible: IntArray
-    found: IntArray
     plane: IntArray
     plane_sigma: FloatArray
 

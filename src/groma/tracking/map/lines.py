@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from groma._numba import loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.features.edge_fit import measure_edges
 from groma.features.images import GrayImage
@@ -22,6 +23,33 @@ from groma.geometry import quaternion, se3, segment2
 from groma.tracking.frame.camera import TrackCamera, into
 from groma.tracking.gates import DEFAULT, LineGates
 from groma.tracking.map.landmarks import LineTable
+
+
+@loop
+def _score_all(expected, ends, limits, score):
+    """Write the mean distance of the ends of segments from expected lines; infinity where they are another line.
+
+    Rows are: ends, direction, length, inverse depth of the middle or NaN.
+    """
+    max_distance, min_cosine, min_overlap, depth_share = limits
+    for i in range(expected.shape[0]):
+        x, y, dx, dy = expected[i, 0], expected[i, 1], expected[i, 4], expected[i, 5]
+        length, inverse = expected[i, 6], expected[i, 7]
+        for j in range(ends.shape[0]):
+            score[i, j] = np.inf
+            if not dx * ends[j, 4] + dy * ends[j, 5] > min_cosine:
+                continue
+            u, v, s, t = ends[j, 0] - x, ends[j, 1] - y, ends[j, 2] - x, ends[j, 3] - y
+            first, second = abs(dx * v - dy * u), abs(dx * t - dy * s)
+            if not max(first, second) < max_distance:
+                continue
+            begin, end = dx * u + dy * v, dx * s + dy * t
+            overlap = min(max(begin, end), length) - max(min(begin, end), 0.0)
+            if not overlap > min_overlap * min(length, ends[j, 6]):
+                continue
+            if abs(inverse - ends[j, 7]) > depth_share * max(inverse, ends[j, 7]):
+                continue
+            score[i, j] = 0.5 * (first + second)
 
 
 def coarse_flow(image_1: GrayImage, image_2: GrayImage, reduction: int) -> Flow:
@@ -146,29 +174,22 @@ def assign(
     none = np.zeros(0, np.int64)
     if not len(expected) or not len(ends):
         return none, none
-    direction, other = segment2.direction(expected), segment2.direction(ends)
-    normal = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
-    start = expected[:, None, :2]
-    first, second = ends[None, :, :2] - start, ends[None, :, 2:] - start
-    across = np.stack([np.einsum("nmk,nk->nm", p, normal) for p in (first, second)])
-    along = np.stack([np.einsum("nmk,nk->nm", p, direction) for p in (first, second)])
-    length, own = segment2.length(expected)[:, None], segment2.length(ends)[None]
-    overlap = np.minimum(along.max(axis=0), length) - np.maximum(along.min(axis=0), 0.0)
-    offset = np.abs(across).max(axis=0)
-    score = np.abs(across).mean(axis=0)
-    good = (direction @ other.T > np.cos(max_angle)) & (offset < max_distance)
-    good &= overlap > gates.min_overlap * np.minimum(length, own)
-    if expected_inverse is not None and inverse is not None:
-        one, two = expected_inverse[:, None], inverse[None]
-        with np.errstate(invalid="ignore"):
-            good &= ~(np.abs(one - two) > gates.depth_share * np.maximum(one, two))
-    score = np.where(good, score, np.inf)
+    one, two = _described(expected, expected_inverse), _described(ends, inverse)
+    score = np.empty((len(one), len(two)))
+    limits = float(max_distance), float(np.cos(max_angle)), float(gates.min_overlap), float(gates.depth_share)
+    _score_all(one, two, limits, score)
     best = np.argmin(score, axis=1)
     rows = np.flatnonzero(np.isfinite(score[np.arange(len(expected)), best]))
     mutual = np.argmin(score, axis=0)[best[rows]] == rows
     # A rival nearly as good makes the pair ambiguous; rivals that continue the same line do not.
     rows = rows[mutual]
     return rows, best[rows]
+
+
+def _described(ends: FloatArray, inverse: FloatArray | None) -> FloatArray:
+    """Rows of :func:`_score_all`."""
+    known = np.full(len(ends), np.nan) if inverse is None else inverse
+    return np.column_stack([ends, segment2.direction(ends), segment2.length(ends), known])
 
 
 def line_ends(

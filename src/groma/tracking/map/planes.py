@@ -24,6 +24,19 @@ def _is_near(samples, places, step, reach):
     return False
 
 
+@loop
+def _refuse_apart(samples, alive, places, rows, begin, limits, score):
+    """Make scores infinite where no place of a plane (``rows`` from its ``begin``) is near a sample of the other."""
+    compared, reach = limits
+    for i in range(score.shape[0]):
+        for j in range(score.shape[1]):
+            if score[i, j] < np.inf:
+                own = rows[begin[j] : begin[j + 1]]
+                step = max(1, len(own) // compared)
+                if not _is_near(samples[alive[i]], places[own], step, reach):
+                    score[i, j] = np.inf
+
+
 def assign_planes(
     planes: PlaneTable,
     seen: FramePlanes,
@@ -47,14 +60,11 @@ def assign_planes(
         return none, none
     in_cam = planes_into(pose, planes.hesse[alive])
     cosine = in_cam[:, :3] @ seen.plane[:, :3].T
-    centers = _region_means(seen)
-    distance = np.abs(in_cam[:, :3] @ centers.T + in_cam[:, 3:])
+    distance = np.abs(in_cam[:, :3] @ seen.means.T + in_cam[:, 3:])
     good = (cosine > np.cos(max_angle)) & (distance < max_distance)
     score = np.where(good, np.arccos(np.clip(cosine, -1, 1)) / max_angle + distance / max_distance, np.inf)
     places = back(pose, seen.places) if good.any() else seen.places
-    for i, j in np.argwhere(good):
-        if not _overlap(planes.samples[alive[i]], places[seen.place_plane == j], gates):
-            score[i, j] = np.inf
+    _refuse_apart(planes.samples, alive, places, *seen.place_rows, (int(gates.compared), float(gates.reach)), score)
     best = score.argmin(axis=1)
     rows = np.flatnonzero(np.isfinite(score[np.arange(len(alive)), best]))
     rows = rows[score.argmin(axis=0)[best[rows]] == rows]
@@ -117,13 +127,6 @@ def merge_planes(planes: PlaneTable, gates: PlaneGates = DEFAULT.planes) -> list
             planes.merged_into[drop] = keep
             merged.append((int(keep), int(drop)))
     return merged
-
-
-def _region_means(seen: FramePlanes) -> FloatArray:
-    count = np.bincount(seen.place_plane, minlength=len(seen))
-    return np.stack(
-        [np.bincount(seen.place_plane, seen.places[:, k], len(seen)) / np.maximum(count, 1) for k in range(3)], axis=1
-    )
 
 
 def _overlap(samples: FloatArray, places: FloatArray, gates: PlaneGates) -> bool:

@@ -113,7 +113,6 @@ def find_again(
         assert patch is not None
         there, good = follow(patch, now, points.pixel[rows[of]], pixel[of], levels=1)
         good &= np.linalg.norm(there - pixel[of], axis=1) < gates.again_radius
-        points.visible[rows[of]] += 1
         points.misses[rows[of[~good]]] += 1
         points.misses[rows[of[good]]] = 0
         found = found.joined(PointTracks(rows[of[good]], there[good]))

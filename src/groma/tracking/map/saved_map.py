@@ -168,10 +168,6 @@ def _note_views(track_map: TrackMap) -> None:
     for keyframe in track_map.keyframes:
         table, edges = keyframe.measured.points, keyframe.measured.lines
         points.keyframe[table.index], points.pixel[table.index] = keyframe.index, table.pixel
-        points.visible[table.index] += 1
-        points.found[table.index] += 1
-        lines.visible[edges.index] += 1
-        lines.found[edges.index] += 1
         _note_first(points.first_keyframe, points.first_pixel, table.index, table.pixel, keyframe.index)
         _note_first(lines.first_keyframe, lines.first_ends, edges.index, edges.ends, keyframe.index)
 

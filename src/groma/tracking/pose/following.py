@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import partial
@@ -12,6 +11,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.features.point_tracks import follow
+from groma.tracking.beside import beside
 from groma.tracking.frame.camera import TrackCamera, into
 from groma.tracking.frame.features import FrameFeatures
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
@@ -52,7 +52,7 @@ def follow_frame(
     camera, options, gates = data.camera, data.options, data.options.gates
     tracks, segments = followed.points, followed.lines
     with_lines = options.lines and len(segments.index) > 0
-    lines_followed = _beside(pool if with_lines else None, partial(follow_lines, track_map, before, data, segments))
+    lines_followed = beside(pool if with_lines else None, partial(follow_lines, track_map, before, data, segments))
     with watch("points"):
         tracks = tracks.take(track_map.points.state[tracks.index] != DEAD)
         if options.points:
@@ -82,13 +82,6 @@ def follow_frame(
     keep[np.flatnonzero(alive)[~estimate.points]] = False
     wrong = lines.index[~estimate.lines]
     segments = segments.take(~np.isin(segments.index, wrong))
-    with watch("lines"):
-        if options.lines:
-            segments = _find_lines_again(track_map, camera, data, estimate.pose, segments)
-    points, line_table = track_map.points, track_map.lines
-    points.found[tracks.index[keep]] += 1
-    points.visible[tracks.index] += 1
-    line_table.visible[segments.index] += 1
     return estimate, Followed(tracks.take(keep), segments)
 
 
@@ -132,7 +125,7 @@ def carry(
     points, lines = new.points, new.lines
     lines = lines.take(~np.isin(lines.index, followed.lines.index))
     with_lines = len(lines.index) > 0
-    lines_followed = _beside(pool if with_lines else None, partial(follow_lines, track_map, before, data, lines))
+    lines_followed = beside(pool if with_lines else None, partial(follow_lines, track_map, before, data, lines))
     points = points.take(~np.isin(points.index, followed.points.index))
     place = into(pose, track_map.points.xyz[points.index])
     expected = camera.project(place)
@@ -143,12 +136,6 @@ def carry(
     pixel, good = follow(before.gray, data.gray, points.pixel[inside], guess[inside], levels=2)
     points = PointTracks(points.index[inside[good]], pixel[good])
     return Followed(followed.points.joined(points), followed.lines.joined(lines_followed() if with_lines else lines))
-
-
-def _beside(pool: Executor | None, work: Callable[[], FollowedSegments]) -> Callable[[], FollowedSegments]:
-    """Begin with some work in another thread; return what gives its result. What none has begun yet is done there."""
-    begun = None if pool is None else pool.submit(work)
-    return lambda: work() if begun is None or begun.cancel() else begun.result()
 
 
 def follow_lines(
@@ -201,22 +188,21 @@ def measure_lines(
     )
 
 
-def _find_lines_again(
-    track_map: TrackMap, camera: TrackCamera, data: FrameFeatures, pose: FloatArray, segments: FollowedSegments
-) -> FollowedSegments:
+def find_lines_again(track_map: TrackMap, data: FrameFeatures, pose: FloatArray, followed: Followed) -> Followed:
     """Look for lines of the map that are in view but not followed, where the pose says they are."""
-    lines, gates = track_map.lines, data.options.gates.lines
+    lines, gates, segments = track_map.lines, data.options.gates.lines, followed.lines
     room = data.options.num_lines - len(segments.index)
-    if room <= 0:
-        return segments
+    if not data.options.lines or room <= 0:
+        return followed
     wanted = lines.alive.copy()
     wanted[segments.index] = False
     rows = np.flatnonzero(wanted)[-gates.again_recent :]
-    expected, seen = expected_segments(camera, lines, rows, pose, gates)
+    expected, seen = expected_segments(data.camera, lines, rows, pose, gates)
     rows, expected = rows[seen][-room:], expected[seen][-room:]
     if not len(rows):
-        return segments
+        return followed
     found, of = measured_edges(data.gray, expected, lines.strength[rows], gates)
     away = np.abs(found.ends - expected[of]).max(axis=1)
     good = away < gates.again_distance
-    return segments.joined(FollowedSegments(rows[of[good]], found.ends[good], found.sigma[good], found.strength[good]))
+    new = FollowedSegments(rows[of[good]], found.ends[good], found.sigma[good], found.strength[good])
+    return Followed(followed.points, segments.joined(new))

@@ -10,18 +10,21 @@ with them, and the best are estimated from all that agrees: points, lines and pl
 from __future__ import annotations
 
 import math
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.geometry import se3
 from groma.localization.pose.gates import VERDICT
-from groma.localization.pose.hypotheses import propose, straightened
+from groma.localization.pose.hypotheses import Straight, propose
 from groma.localization.pose.matches import Matches
+from groma.tracking.beside import beside
 from groma.tracking.frame.camera import TrackCamera, back, into
-from groma.tracking.frame.descriptor_pairs import pair_anywhere, pair_near
-from groma.tracking.frame.features import Descriptors, Features, FrameFeatures
+from groma.tracking.frame.descriptor_pairs import PlacedFeatures, pair_anywhere, pair_near
+from groma.tracking.frame.features import Descriptors, FrameFeatures
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
 from groma.tracking.gates import DEFAULT
 from groma.tracking.map.feature_points import points_of_features
@@ -65,16 +68,14 @@ def known_features(track_map: TrackMap, camera: TrackCamera, keyframes: list[Key
 def match_near(
     camera: TrackCamera,
     known: KnownFeatures,
-    features: Features,
+    features: PlacedFeatures,
     pose: FloatArray,
     radius: float,
     max_bits: int = DEFAULT.features.max_bits_near,
 ) -> IntArray:
     """Pair known features with features of a frame (n, 2): near where a pose says, and most alike for both."""
     expected = camera.project(into(pose, known.places))
-    rows = np.flatnonzero(camera.inside(expected, -radius))
-    pairs = pair_near(expected[rows], known.descriptor[rows], features.pixel, features.descriptor, radius, max_bits)
-    return np.column_stack([rows[pairs[:, 0]], pairs[:, 1]])
+    return pair_near(expected, known.descriptor, features, radius, max_bits)
 
 
 def feature_places(track_map: TrackMap, camera: TrackCamera, keyframe: Keyframe, rows: IntArray) -> FloatArray:
@@ -99,7 +100,9 @@ def pose_from_matches(
 
     It is the best that few matches propose, fitted to those that agree; :func:`estimate_pose` weighs them.
     """
-    straight = straightened(camera.query, Matches(pixel, places))
+    # Frames are free of distortion, so pixels are where they should be.
+    every, none = np.ones(len(pixel), dtype=bool), np.zeros(0, dtype=bool)
+    straight = Straight(camera.pinhole, Matches(pixel, places), every, none)
     # A pose that fewer agree with is of no interest; it need not be looked for as long.
     pose = propose(straight, (max_error, max_error), 0, min_inliers / max(len(pixel), 1))
     if pose is None:
@@ -148,11 +151,16 @@ def find_pose(
     guesses: list[FloatArray],
     predicted: FloatArray,
     prior_sigma: FloatArray,
+    pool: Executor | None = None,
 ) -> Found | None:
-    """Find the pose of a frame near some keyframes; ``guesses`` are poses to be tried as well."""
+    """Find the pose of a frame near some keyframes; ``guesses`` are poses to be tried as well.
+
+    What the first keyframe proposes hangs on no guess, and is worked out in a pool.
+    """
     search = _Search(track_map, camera, data, known_features(track_map, camera, keyframes), predicted, prior_sigma)
     gates = data.options.gates
     strong = gates.verification.strong
+    first = beside(pool, partial(search.proposal, keyframes[0]))
     best: Found | None = None
     for guess in search.in_order(guesses):
         near = search.proposal_near(guess)
@@ -162,7 +170,7 @@ def find_pose(
     if best is not None and best.score >= strong:
         # What repeats itself agrees with a wrong guess, too; what no guess suggests may agree with more.
         keyframes = keyframes[:1]
-    others = [search.proposal(keyframe) for keyframe in keyframes]
+    others = [first(), *(search.proposal(keyframe) for keyframe in keyframes[1:])]
     return search.best_of([pose for pose in others if pose is not None], gates.finding.max_refined)
 
 
@@ -176,13 +184,15 @@ class _Search:
         self._best: Found | None = None
         self._tried: list[FloatArray] = []
         self._near: dict[tuple[bytes, float], IntArray] = {}
+        self._planes: dict[bytes, PlaneMeasurements] = {}
+        self._features = PlacedFeatures.of(data.features.pixel, data.features.descriptor)
 
     def near(self, pose: FloatArray, radius: float) -> IntArray:
         """Pairs (n, 2) of known features and features of the frame, near where a pose says; poses are asked again."""
         asked = pose.tobytes(), radius
         if asked not in self._near:
             max_bits = self.all_gates.features.max_bits_near
-            self._near[asked] = match_near(self.camera, self.known, self.data.features, pose, radius, max_bits)
+            self._near[asked] = match_near(self.camera, self.known, self._features, pose, radius, max_bits)
         return self._near[asked]
 
     def proposal_near(self, guess: FloatArray) -> FloatArray | None:
@@ -236,13 +246,15 @@ class _Search:
     def _agreeing(self, pose: FloatArray) -> float:
         """Features and planes that roughly agree with a pose."""
         count = float(len(self.near(pose, 3 * self.gates.near)))
-        if not self.data.planes:
-            return count
-        gates = self.all_gates.planes
-        planes = assign_planes(
-            self.track_map.planes, self.data.planes, pose, gates.wide_angle, gates.wide_distance, gates
-        )
-        return count + self.gates.plane_weight * len(planes[0])
+        return count + self.gates.plane_weight * len(self._planes_at(pose)) if self.data.planes else count
+
+    def _planes_at(self, pose: FloatArray) -> PlaneMeasurements:
+        """Planes of the frame that agree with a pose; poses are asked again."""
+        asked = pose.tobytes()
+        if asked not in self._planes:
+            own = self.all_gates.planes
+            self._planes[asked] = match_planes(self.track_map, self.data, pose, own.wide_angle, own.wide_distance)
+        return self._planes[asked]
 
     def _is_known(self, start: FloatArray) -> bool:
         """Whether a start is as good as at a pose that was tried."""
@@ -267,7 +279,7 @@ class _Search:
             lines, line_table = match_lines(
                 track_map, camera, data, pose, factor * own.lines.distance, factor * own.lines.angle
             )
-            planes = match_planes(track_map, data, pose, own.planes.wide_angle, own.planes.wide_distance)
+            planes = self._planes_at(pose)
             if len(pairs) + len(line_table) + len(planes) < 3:
                 return None
             view = replace(track_map.view, points=temporary)

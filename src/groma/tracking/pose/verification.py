@@ -8,11 +8,12 @@ depth is known, it must; and a pose that was searched must not look through what
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
+
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.geometry import se3
-from groma.tracking.frame.camera import TrackCamera, into
+from groma.tracking.frame.camera import TrackCamera, apart, into
 from groma.tracking.frame.features import FrameFeatures
 from groma.tracking.map.points import PointTracks
 from groma.tracking.map.track_map import Keyframe, TrackMap
@@ -41,10 +42,8 @@ class PoseVerification:
     def is_near(self, pose: FloatArray, predicted: FloatArray, sigma: FloatArray, gate: float | None = None) -> bool:
         """Whether the camera can have got, and turned, from where it was predicted to where a pose says."""
         gate = self.gates.jump if gate is None else gate
-        centers = se3.inverse(np.stack([pose, predicted]))[:, 4:]
-        turn = se3.log(se3.compose(pose[None], se3.inverse(predicted[None])))[0, 3:]
-        went = np.linalg.norm(centers[1] - centers[0]) < gate * np.linalg.norm(sigma[:3])
-        return bool(went and np.linalg.norm(turn) < gate * np.linalg.norm(sigma[3:]))
+        shift, turn = apart(pose, predicted)
+        return bool(shift < gate * np.linalg.norm(sigma[:3]) and turn < gate * np.linalg.norm(sigma[3:]))
 
     def trusts(self, track_map: TrackMap, data: FrameFeatures, estimate: PoseEstimate) -> bool:
         """Whether enough agrees with the pose of a frame that was followed; depth decides where that is not much."""
@@ -114,10 +113,11 @@ class PoseVerification:
         predicted: FloatArray,
         prior_sigma: FloatArray,
         lost_for: int,
+        pool: Executor | None = None,
     ) -> Found | None:
         """Find a frame by described features: near the last keyframes first, then anywhere."""
         if lost_for <= self.gates.lost_frames:
-            found = self.find_near(track_map, data, guesses, predicted, prior_sigma)
+            found = self.find_near(track_map, data, guesses, predicted, prior_sigma, pool)
             if found is not None:
                 return found
         found = self.find_anywhere(track_map, data)
@@ -132,10 +132,12 @@ class PoseVerification:
         guesses: list[FloatArray],
         predicted: FloatArray,
         prior_sigma: FloatArray,
+        pool: Executor | None = None,
     ) -> Found | None:
-        """Find a frame by described features, near the last keyframes."""
+        """Find a frame by described features, near the last keyframes; a part of it in a pool."""
         nearest = track_map.living()[::-1][: self.gates.nearest]
-        found = find_pose(track_map, self.camera, data, nearest, guesses, predicted, self.gates.wider * prior_sigma)
+        wider = self.gates.wider * prior_sigma
+        found = find_pose(track_map, self.camera, data, nearest, guesses, predicted, wider, pool)
         if found is None or not self.is_near(found.estimate.pose, predicted, prior_sigma) or self._denied(data, found):
             return None
         # Rooms are alike at both ends, in depth too: of the features in view some must agree.

@@ -26,6 +26,7 @@ import numpy as np
 from groma._version import __version__
 from groma.errors import InputError, OutputError
 from groma.execution import beside
+from groma.scene.checks import check_scene_given
 from groma.viz.drawable import Drawable, drawable
 from groma.viz.pack import script_json
 from groma.viz.pictures import ImageFiles
@@ -123,6 +124,7 @@ def write_report(
     OutputError
         If the file cannot be written.
     """
+    check_scene_given(scene_after, "scene_after")
     after = drawable(scene_after)
     before = drawable(scene_before) if scene_before is not None else None
     if before is not None and not _same_shape(before, after):

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import logit
+import scipy  # its parts are imported when something of them is first used
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.gates import gate
@@ -108,7 +108,7 @@ def is_edge(
     again = found_again(kinds.length, kinds.strength, line_of, possible, len(seen), least)
     told = kinds.length, kinds.strength, kinds.sigma
     odds = edge_odds(told, line_of, possible, seen, expected, options.min_images)
-    return again & (odds >= logit(gates.min_edge_probability))
+    return again & (odds >= scipy.special.logit(gates.min_edge_probability))
 
 
 def not_duplicate(tracks: Tracks, evidence: Evidence) -> Verdict:

@@ -26,7 +26,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.special import betaln, expit, gammaln, log_expit
+import scipy  # its parts are imported when something of them is first used
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_in_threads
@@ -116,6 +116,7 @@ def edge_odds(
     gates : TextureGates, optional
         The two populations, and the priors.
     """
+    expit, log_expit = scipy.special.expit, scipy.special.log_expit
     member = line_of >= 0
     features = features_of(eligible | member, *kinds)
     leftover = features[eligible & ~member]
@@ -164,6 +165,7 @@ def _log_chance(seen: IntArray, expected: IntArray, min_images: int, kind: tuple
 
 def _beta_binomial(hits: FloatArray, tries: FloatArray, kind: tuple[float, float]) -> FloatArray:
     """Log probability of so many hits, of tries whose chance is drawn from a beta law."""
+    gammaln, betaln = scipy.special.gammaln, scipy.special.betaln
     a, b = kind[0] * kind[1], (1.0 - kind[0]) * kind[1]
     hits = np.minimum(hits, tries)
     number = gammaln(tries + 1) - gammaln(hits + 1) - gammaln(tries - hits + 1)

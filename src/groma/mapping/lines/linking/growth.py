@@ -20,7 +20,7 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-from scipy.special import ndtri
+import scipy  # its parts are imported when something of them is first used
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_work
@@ -176,5 +176,5 @@ def _noise_scale(tracks: Tracks) -> float:
         return 1.0
     freedom = 2.0 - 4.0 / number
     spread = 2.0 / (9.0 * freedom)
-    expected = freedom * (1.0 - spread + ndtri(tracks.gates.noise_quantile) * np.sqrt(spread)) ** 3
+    expected = freedom * (1.0 - spread + scipy.special.ndtri(tracks.gates.noise_quantile) * np.sqrt(spread)) ** 3
     return float(np.sqrt(np.quantile(tracks.squared[rows] / expected, tracks.gates.noise_quantile)))

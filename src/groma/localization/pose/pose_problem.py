@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The problem of one pose and its matches: without a scene, unless lens or lines ask for one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from groma._typing import FloatArray
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
+from groma.adjustment.one_image import one_image_problem
+from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.matches import Matches
+from groma.problem.problem import Problem
+from groma.scene import LineObservations, Lines, PointObservations, Points, Scene
+
+_ASSEMBLY = AssemblyOptions(
+    point_chart="euclidean", drop_behind=False, require_in_front=True, gauge="free", refine_landmarks=False
+)
+
+
+def problem_of(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_lens: bool = False) -> Problem:
+    """The problem of one pose, with the noise of the image alone."""
+    lines = Lines.through(matches.segments3d)
+    if not refine_lens and (camera.kind.has_pinhole_parameters or not matches.num_lines):
+        return one_image_problem(
+            (camera.kind, camera.params), pose, (matches.points2d, matches.points3d, matches.point_sigma),
+            (matches.segments2d.reshape(-1, 4), lines.plucker, matches.segment_sigma),
+        )  # fmt: skip
+    image = np.zeros(matches.num_points, np.int64), np.zeros(matches.num_lines, np.int64)
+    scene = Scene.from_images(
+        camera.table(), ["query"], [0], pose[None],
+        points=Points.at(matches.points3d),
+        point_observations=PointObservations.numbered(
+            image[0], np.arange(matches.num_points), matches.points2d, matches.point_sigma
+        ),
+        lines=lines,
+        line_observations=LineObservations(
+            image[1], np.arange(matches.num_lines), matches.segments2d.reshape(-1, 4), matches.segment_sigma
+        ),
+    )  # fmt: skip
+    return assemble(scene, replace(_ASSEMBLY, refine_intrinsics=refine_lens)).problem
