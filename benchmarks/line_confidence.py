@@ -5,8 +5,9 @@
 
 A line is right if at least half of what images support of it lies within 2.5 thousandths of the usual distance of lines
 from their cameras from a true edge. Prints the weights for ``groma.mapping.lines.confidence.WEIGHTS``, the share of
-right lines by predicted probability, and what lines of at least some probability find and are worth. Maps are kept in
-the cache.
+right lines by predicted probability, and what lines of at least some probability find and are worth. Cameras are held:
+probabilities are those of the lines as mapped, and whether they are right is asked of the adjusted ones, as in a map.
+Maps are kept in the cache.
 """
 
 from __future__ import annotations
@@ -79,15 +80,17 @@ class Judged:
 
 def judged(source: LineScene, cache: Path) -> Judged:
     """Map a scene, or take the map from the cache, and compare its lines with the edges."""
-    file = cache / f"{source.name}.npz"
-    if not file.exists():
+    file, before = cache / f"{source.name}.npz", cache / f"{source.name}-before.npz"
+    if not (file.exists() and before.exists()):
         file.parent.mkdir(parents=True, exist_ok=True)
         settings = MapOptions(refine_poses=False, threads=1, min_confidence=0.0)
         segments = source.segments(MIN_LENGTH.get(source.name, settings.lines.min_length))
         with tempfile.TemporaryDirectory() as work, Stages(Path(work), source.name, settings) as stages:
             points = stages.run(adjust_points, source.scene)
-            write_archive(map_segments(points, segments, None, stages).scene, file)
-    scene = read_archive(file)
+            result = map_segments(points, segments, None, stages)
+            write_archive(result.scene, file)
+            write_archive(result.before, before)
+    scene, mapped = read_archive(file), read_archive(before)
     ends, line = line_pieces(scene)
     places, owner = places_on(ends, np.full(len(ends), _PLACES))
     tau = GATES.tolerance * usual_distance(scene)
@@ -98,7 +101,7 @@ def judged(source: LineScene, cache: Path) -> Judged:
     if source.box is not None:
         inside = ((places >= source.box[0]) & (places <= source.box[1])).all(axis=1)
         counted = np.bincount(line[owner], inside) / np.bincount(line[owner]) > 0.9
-    return Judged(source, scene, line_evidence(scene), line_accuracy(scene), share >= 0.5, counted)
+    return Judged(source, scene, line_evidence(mapped), line_accuracy(mapped), share >= 0.5, counted)
 
 
 def probability(one: Judged, weights: np.ndarray) -> np.ndarray:
