@@ -36,7 +36,7 @@ def refuse_focal_lengths(scene: Scene) -> None:
     cameras, used = scene.cameras, _used(scene)
     for name, rows in cameras.by_model().items():
         model = camera_model(name)
-        needed = cameras.params[np.ix_(rows, [*model.focal_indices, *model.known_indices])]
+        needed = cameras.params[rows][:, [*model.focal_indices, *model.known_indices]]
         bad = used[rows] & ~(np.isfinite(needed) & (needed > 0.0)).all(axis=1)
         if not bad.any():
             continue
