@@ -157,7 +157,7 @@ def test_few_steps_where_points_lie_on_lines():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: adjust("model"), r"takes a groma\.Scene; got str.*read_scene"),
+        (lambda: adjust("model"), r"scene must be a Scene; got str.*read_scene"),
         (lambda: AdjustOptions(point_sigma_px=0.0), "point_sigma_px must be a positive number"),
         (lambda: AdjustOptions(line_sigma_px=float("nan")), "line_sigma_px must be a positive number"),
     ],

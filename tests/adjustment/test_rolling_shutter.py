@@ -138,7 +138,7 @@ def test_a_later_format_is_refused(tmp_path):
 
 def test_what_cannot_be_is_refused():
     scene = synthetic.holistic(4).start
-    nowhere = scene.replace(cameras=scene.cameras.replace(height=[0]))
+    nowhere = scene.replace(cameras=scene.cameras.replace(width=[0], height=[0]))
     with pytest.raises(InputError, match="needs the size of the images"):
         with_rolling_shutter(nowhere)
     seen = PointDepths([0], [0], [1.0], [0.1])

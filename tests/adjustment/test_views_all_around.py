@@ -159,7 +159,7 @@ def test_lines_are_drawn_all_around_a_panorama():
 
 def test_a_panorama_without_size_is_refused():
     _, start, _ = room("EQUIRECTANGULAR")
-    with pytest.raises(groma.ProblemError, match=r"positive width and height.*EQUIRECTANGULAR.*\[0.0, 1000.0\]"):
+    with pytest.raises(groma.ProblemError, match=r"EQUIRECTANGULAR.*positive width and height.*\[0.0, 1000.0\]"):
         groma.adjust(start.with_params(np.array([[0.0, 1000.0]])))
 
 

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from groma._numba import kernel, loop
+from groma._ordering import copy
 from groma._typing import FloatArray
 from groma.estimators.batch_least_squares import solve_damped
 from groma.factors.losses import Loss, loss_derivatives
@@ -250,12 +251,14 @@ def _fit(pose, seen, loss_tag, parameters):
                 _move(pose, 1.0 / min(max(2.0 - ratio, 1.0 / _MOST), _MOST), step, other)
                 farther = _sum(other, seen, loss_tag, parameters, H[beyond], g[beyond], worst)
                 if farther < found:
-                    tried[:], found = other, farther
+                    copy(other, tried)
+                    found = farther
                     there, beyond = beyond, there
             fell = cost - found
         before = cost
         if fell > 0.0:
-            pose[:], cost = tried, found
+            copy(tried, pose)
+            cost = found
             here, there = there, here
             damping, growth = damping / _LOWERED, 2.0
         else:

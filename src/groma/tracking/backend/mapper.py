@@ -384,7 +384,7 @@ class Mapper:
             return None, PlaneOutcome(searched, 0, 0)
         report = self._adjust_all()
         dropped, gone = drop_what_failed(track_map, self.camera, gates)
-        if gone:
+        if dropped or gone:
             report = self._adjust_all()
         points, lines = (int((table.alive & (table.plane >= 0)).sum()) for table in (track_map.points, track_map.lines))
         return report, PlaneOutcome(searched, found, found - gone, points, lines, dropped)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from groma._numba import loop
+from groma._ordering import copy
 from groma._typing import BoolArray, FloatArray
 from groma.cameras import model as camera_model
 from groma.errors import InputError
@@ -31,7 +32,8 @@ def _clip_segments(ends_in_cam, K, size, limits, ends, seen):
     near, border = limits
     P, start, way = np.empty((2, 3)), np.empty(2), np.empty(2)
     for i in range(ends_in_cam.shape[0]):
-        P[:] = ends_in_cam[i]
+        copy(ends_in_cam[i, 0], P[0])
+        copy(ends_in_cam[i, 1], P[1])
         if not (P[0, 2] > near or P[1, 2] > near):
             continue
         for one in range(2):

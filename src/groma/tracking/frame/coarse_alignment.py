@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._numba import kernel, loop
+from groma._ordering import copy
 from groma._typing import FloatArray
 from groma.estimators.batch_least_squares import solve_damped
 from groma.geometry import quaternion, se3, so3
@@ -123,7 +124,9 @@ def _turn_until_best(before, now, K, limits, steps, best):
         if share < min_overlap:
             break
         if score > best_score:
-            best[:], best_score = turn, score
+            best_score = score
+            for i in range(3):
+                copy(turn[i], best[i])
         little = 1e-6 * (H[0, 0] + H[1, 1] + H[2, 2] + 1.0)
         for k in range(3):
             H[k, k] += little
@@ -133,7 +136,8 @@ def _turn_until_best(before, now, K, limits, steps, best):
         for i in range(3):
             for j in range(3):
                 after[i, j] = by[3 * i] * turn[0, j] + by[3 * i + 1] * turn[1, j] + by[3 * i + 2] * turn[2, j]
-        turn[:] = after
+        for i in range(3):
+            copy(after[i], turn[i])
         if max(abs(omega[0]), abs(omega[1]), abs(omega[2])) * K[0, 0] < converged:
             break
     return best_score
