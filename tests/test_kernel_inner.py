@@ -2,6 +2,7 @@
 """Functions compiled for linking only: callable from Python all the same, in any order, thread and process, and with
 the numbers of Numba's own way."""
 
+import math
 import os
 import subprocess
 import sys
@@ -9,6 +10,7 @@ import threading
 from itertools import pairwise
 from pathlib import Path
 
+import llvmlite.binding as llvm
 import numba
 import numpy as np
 import pytest
@@ -76,6 +78,49 @@ def test_a_loop_inlines_what_python_has_called(pair):
 def test_an_error_inside_is_raised(pair):
     with pytest.raises(ValueError, match="nothing to divide by"):
         pair[1](np.array([1.0, 0.0]))
+
+
+@loop
+def _long(x):
+    """Too long to be inlined."""
+    for _ in range(3):
+        x = math.sin(x) + math.cos(2.0 * x) + math.tan(3.0 * x) + math.exp(-x * x) + math.log(1.0 + x * x)
+        x = (
+            math.sinh(x)
+            + math.cosh(x)
+            + math.tanh(x)
+            + math.asinh(x)
+            + math.atan(x)
+            + math.erf(x)
+           
+        )
+        x = math.sin(4.0 * x) + math.cos(5.0 * x) + math.tan(6.0 * x) + math.exp(-x) + math.log(2.0 + x * x)
+        x = (
+            math.sinh(x)
+            - math.cosh(x)
+            + math.tanh(x)
+            + math.asinh(x)
+            - math.atan(x)
+            + math.erf(x)
+           
+        )
+    return x
+
+
+@loop
+def _twice(values):
+    return _long(values[0]) + _long(values[1])
+
+
+def test_what_is_linked_in_is_of_one_library_alone(tmp_path, monkeypatch):
+    """Else the library that is loaded first gives its code to the others: digits would hang on the order."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    twice = loop(_twice.py_func)  # not on disk
+    twice(VALUES)
+    library = twice.overloads[numba.typeof(VALUES),].library
+    defined = {f.name: f.linkage for f in library._final_module.functions if not f.is_declaration}
+    assert any("_long" in name for name in defined)
+    assert llvm.Linkage.linkonce_odr not in defined.values()
 
 
 def test_functions_of_numba_alone_between(pair):

@@ -58,7 +58,15 @@ class _NoMachineCode:
 
 
 class _Library(JITCodeLibrary):
-    """Code of a function that Python calls; the wrapper, which unpacks arguments, is not optimised."""
+    """Code of a function that Python calls; the wrapper, which unpacks arguments, is not optimised.
+
+    What it calls is linked in, and is its own. Otherwise, of all libraries with a function of the same name, each
+    optimised in its own way, the one that is loaded first would give its code to the others, and the last digits of
+    results would hang on the order of loading.
+    """
+
+    #: Whether what was linked in is of no use to other libraries.
+    _owns = True
 
     def _optimize_functions(self, ll_module: Any) -> None:
         ll_module.data_layout = self._codegen._data_layout
@@ -72,9 +80,17 @@ class _Library(JITCodeLibrary):
             passes, builder = self._codegen._function_pass_manager()
             passes.run(function, builder)
 
+    def _optimize_final_module(self) -> None:
+        for function in self._final_module.functions if self._owns else ():
+            if function.linkage == llvm.Linkage.linkonce_odr:
+                function.linkage = llvm.Linkage.internal
+        super()._optimize_final_module()
+
 
 class _InnerLibrary(_Library):
     """Code of a function that is linked into others."""
+
+    _owns = False
 
     def _finalize_final_module(self) -> None:
         self._finalize_dynamic_globals()
