@@ -85,25 +85,9 @@ def _long(x):
     """Too long to be inlined."""
     for _ in range(3):
         x = math.sin(x) + math.cos(2.0 * x) + math.tan(3.0 * x) + math.exp(-x * x) + math.log(1.0 + x * x)
-        x = (
-            math.sinh(x)
-            + math.cosh(x)
-            + math.tanh(x)
-            + math.asinh(x)
-            + math.atan(x)
-            + math.erf(x)
-           
-        )
+        x = math.sinh(x) + math.cosh(x) + math.tanh(x) + math.asinh(x) + math.atan(x) + math.erf(x)
         x = math.sin(4.0 * x) + math.cos(5.0 * x) + math.tan(6.0 * x) + math.exp(-x) + math.log(2.0 + x * x)
-        x = (
-            math.sinh(x)
-            - math.cosh(x)
-            + math.tanh(x)
-            + math.asinh(x)
-            - math.atan(x)
-            + math.erf(x)
-           
-        )
+        x = math.sinh(x) - math.cosh(x) + math.tanh(x) + math.asinh(x) - math.atan(x) + math.erf(x)
     return x
 
 
