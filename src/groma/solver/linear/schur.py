@@ -32,8 +32,9 @@ from groma.problem.parallel import OrderedSums, Spans, sum_of
 #: Diagonal entries are damped as if they were at least this large, so that nothing is divided by zero. It is no
 #: tolerance: entries change with the square of the unit of length, and what the solver does must not.
 MIN_DIAGONAL = 1e-100
-#: Curvatures count as at least this.
-SMALLEST = float(np.finfo(float).tiny)
+#: Curvatures count as at least this, and as at least this share of the squared gradient (derived from the range of
+#: numbers: a ratio and its product with a curvature stay inside).
+SMALLEST = 1e-200
 #: Damping of landmarks by kind, relative to that of all other variables; 1 where a kind is not named. The damping is
 #: measured by the diagonal, which says little about the depth of a far point: along its rays the cost is flatter by the
 #: square of the angle between them, and a damping that suits the cameras holds the point back for many steps.
@@ -64,7 +65,8 @@ def invert_blocks(V, g, damping, step, begin, end, N, h, dof):
         for j in range(n):
             square = g[p * n + j] * g[p * n + j]
             if not square <= steepest * V[v0 + j * n + j] and steepest == steepest:
-                steepest = square / max(V[v0 + j * n + j], SMALLEST)  # what is not a number stays
+                # What is not a number stays.
+                steepest = square / max(V[v0 + j * n + j], SMALLEST * max(square, 1.0))
         # V + damping D = L diag(pivots) L^T with a unit lower triangle
         for j in range(n):
             diagonal = V[v0 + j * n + j]
