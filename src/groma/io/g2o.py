@@ -122,6 +122,8 @@ def is_g2o(path: Path) -> bool:
     """Tell whether a file holds a pose graph: by its name (.g2o, .g2o.gz), or by how it begins."""
     if path.name.lower().endswith((".g2o", ".g2o.gz")):
         return True
+    if not path.is_file():
+        return False
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD_BYTES)
