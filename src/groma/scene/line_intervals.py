@@ -106,9 +106,10 @@ def shares_on_lines(
     """
     poses = scene.cam_from_world[image_idx]
     bearing = np.full((len(pixels), 3), np.nan)
-    camera, names = scene.images.camera_idx[image_idx], np.array(scene.cameras.models, dtype=object)
+    camera = scene.images.camera_idx[image_idx]
     for name in dict.fromkeys(scene.cameras.models):
-        rows, model = np.flatnonzero(names[camera] == name), camera_model(name)
+        rows = np.flatnonzero(np.array([one == name for one in scene.cameras.models])[camera])
+        model = camera_model(name)
         params = scene.cameras.params[camera[rows], : model.num_parameters]
         bearing[rows] = model.unproject(np.ascontiguousarray(params), np.ascontiguousarray(pixels[rows]))
     ray = quaternion.rotate(quaternion.conjugate(poses[:, :4]), bearing)
