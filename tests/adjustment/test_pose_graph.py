@@ -53,6 +53,25 @@ def test_true_poses_come_back(rng, planar):
     assert len(result.outliers) == 0
 
 
+def test_the_start_is_the_cheaper_of_poses_and_motions(rng):
+    """From zero, as from poses far off, the motions lead; near the minimum, or where poses are held, the poses do."""
+    truth, graph = ring(rng, count=40, noise=0.01)
+    zero = np.tile([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], (40, 1))
+    unknown = graph.replace(poses=graph.poses.replace(world_from_body=zero))
+    result = adjust_pose_graph(unknown)
+    assert result.from_motions and result.summary()["from_motions"]
+    near = adjust_pose_graph(result.graph)
+    assert not near.from_motions and near.report.initial_cost == pytest.approx(result.report.final_cost, rel=1e-6)
+    found = se3.compose(truth[0], result.graph.poses.world_from_body)
+    from_truth = adjust_pose_graph(graph).graph.poses.world_from_body
+    np.testing.assert_allclose(se3.log(se3.compose(se3.inverse(from_truth), found)), 0.0, atol=1e-4)
+    held = np.zeros(40, dtype=bool)
+    held[20] = True
+    kept = adjust_pose_graph(unknown.replace(poses=unknown.poses.replace(held=held)))
+    assert not kept.from_motions
+    np.testing.assert_array_equal(kept.graph.poses.world_from_body[20], zero[20])
+
+
 def test_poses_of_the_plane_stay_there(rng):
     _, graph = ring(rng, planar=True, noise=0.02)
     poses = adjust_pose_graph(disturbed(rng, graph, 0.2)).graph.poses.world_from_body

@@ -6,8 +6,8 @@ With the measured :math:`Z_{ij}` (``first_from_second``) and poses :math:`X` (``
 .. math:: \tfrac12 \sum_{ij} \rho\big(\lVert \mathrm{Log}(Z_{ij}^{-1} X_i^{-1} X_j) \rVert^2_{\Sigma_{ij}^{-1}}\big) .
 
 Place recognition errs now and then, and one wrong motion between distant poses bends the whole graph. A robust loss
-lets go of it, if the poses at the start are about right; :meth:`groma.scene.pose_graph.PoseGraph.chained` makes a start
-from the motions.
+lets go of it, if the poses at the start are about right. The start is the poses of the graph or, where that costs less,
+the motions put one after the other (:meth:`groma.scene.pose_graph.PoseGraph.chained`).
 """
 
 from __future__ import annotations
@@ -73,6 +73,8 @@ class PoseGraphResult:
     chi_square: FloatArray
     #: Motions beyond the scale of the loss after the adjustment; none for plain least squares.
     outliers: IntArray
+    #: Whether it began from the motions put one after the other, which cost less than the poses that were given.
+    from_motions: bool = False
 
     @property
     def num_parts(self) -> int:
@@ -98,6 +100,7 @@ class PoseGraphResult:
             "planar": graph.planar,
             "initial_cost": report.initial_cost,
             "final_cost": report.final_cost,
+            "from_motions": self.from_motions,
             "iterations": report.iterations,
             "termination": report.termination.key,
             "converged": report.converged,
@@ -137,7 +140,8 @@ def adjust_pose_graph(
     if not len(graph.motions):
         poses = counted(len(graph.poses), "poses")
         raise InputError(f"The graph has {poses} and no motions between them; nothing to adjust.")
-    problem = pose_graph_problem(graph, options)
+    given = pose_graph_problem(graph, options)
+    problem = _cheaper_start(graph, given)
     settings = SolverOptions(
         max_iterations=options.max_iterations,
         linear_solver=options.linear_solver,
@@ -149,7 +153,7 @@ def adjust_pose_graph(
         return progress(Progress(step.iteration, options.max_iterations, step.cost)) if progress is not None else None
 
     solution = solve(problem, settings, show)
-    before, after = (_chi_squares(graph, options, at) for at in (problem, solution.problem))
+    before, after = (_chi_squares(graph, options, at) for at in (given, solution.problem))
     robust = problem.factors[1]
     beyond = after > getattr(robust.loss, "scale", np.inf) ** 2
     beyond[_rows(graph, options)[0]] = False
@@ -160,6 +164,7 @@ def adjust_pose_graph(
         chi_square_before=before,
         chi_square=after,
         outliers=np.flatnonzero(beyond),
+        from_motions=problem is not given,
     )
 
 
@@ -212,6 +217,23 @@ def motion_factors(motions: Motions, group: str) -> PoseBetween:
         first_from_second=motions.first_from_second,
         sqrt_information=_roots(motions.information),
     )
+
+
+def _cheaper_start(graph: PoseGraph, problem: Problem) -> Problem:
+    """Return the problem of a graph, or the same with the motions put one after the other where that costs less.
+
+    Poses that are held keep their place: the first of each part does, others are not on the way of the motions.
+    """
+    is_first = np.zeros(len(graph.poses), dtype=bool)
+    is_first[np.unique(graph.parts(), return_index=True)[1]] = True
+    if (graph.poses.held & ~is_first).any():
+        return problem
+    chained = problem.with_states({"poses": se3.inverse(graph.chained().poses.world_from_body)})
+    return chained if _cost(chained) < _cost(problem) else problem
+
+
+def _cost(problem: Problem) -> float:
+    return sum(float(f.loss.evaluate(squared_norms(f, problem.variables))[0].sum()) for f in problem.factors)
 
 
 def _rows(graph: PoseGraph, options: PoseGraphOptions) -> tuple[IntArray, IntArray]:

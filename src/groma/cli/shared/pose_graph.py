@@ -54,6 +54,8 @@ def adjust_graph_and_write(
     costs = f"Cost {numbers['initial_cost']:.5g} -> {numbers['final_cost']:.5g}"
     steps = counted(numbers["iterations"], "steps")
     console.say(f"{costs}, {steps} in {time}. {result.report.termination.sentence}")
+    if result.from_motions:
+        console.say("It began from the motions put one after the other: that costs less than the poses of the file.")
     for sentence in result.warnings:
         console.warn(sentence)
     if output is not None:
