@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Where Numba's compiler uses variables for the last time, found out when it is asked for.
 
-Numba finds it anew after each of nine steps, though three of them ask; a tenth of the Python time of a compilation. Here
-a step leaves a description that finds it when it is read, and the variables of a statement are listed with fewer calls.
+Numba finds it anew after each of nine steps, though three of them ask: a tenth of the time that Python takes of a
+compilation. Here it is found when it is read, and the variables of a statement are listed with fewer calls.
 
 In come classes of Numba's compiler; out comes ``on_demand``, inside which they do so.
 """

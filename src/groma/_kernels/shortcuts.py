@@ -69,9 +69,12 @@ class _Typing:
 
     def _remembered(self, key: Any, kept: Any, name: str, *asked: Any) -> Any:
         """Return an answer of Numba's; ``kept`` is what must not go, as long as the key names it by its place."""
-        if key not in _meanings:
-            _meanings[key] = kept, getattr(self._context, name)(*asked)
-        return _meanings[key][1]
+        if key in _meanings:
+            return _meanings[key][1]
+        answer = getattr(self._context, name)(*asked)
+        if answer is not None:  # later there may be one
+            _meanings[key] = kept, answer
+        return answer
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
