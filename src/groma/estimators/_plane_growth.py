@@ -149,6 +149,18 @@ def _polished_loop(features, rows, band, gates, mark, layer, joined, numbers, pl
     return count, share
 
 
+@loop
+def _grow_loop(features, labels, gates, others, mark, room, joined, numbers, plane, center):
+    """Refine and polish a plane; return its number of features, half thickness, and what its layer holds and shares."""
+    count, band = _refined_loop(features, labels, gates, mark, room, numbers, plane)
+    inner, share = 0, 0.0
+    if band > 0.0:
+        inner, share = _polished_loop(
+            features, room[2, :count], band, others, mark, room[3], joined, numbers, plane, center
+        )  # fmt: skip
+    return count, band, inner, share
+
+
 @dataclass(frozen=True)
 class Grown:
     """A plane that is kept."""
@@ -198,17 +210,13 @@ class Grower:
         features, options, plane, center = self._features, self._options, plane.copy(), np.empty(3)
         first = features.neighbours[home]
         self._room[2, : len(first)] = first
-        arrays, inner, share = features.arrays, 0, 0.0
-        count, band = _refined_loop(arrays, labels, self._refining, self._mark, self._room, self._numbers, plane)
-        rows = self._room[2, :count].copy()
-        if band > 0.0:
-            inner, share = _polished_loop(
-                arrays, rows, band, self._polishing, self._mark, self._room[3], self._joined, self._numbers, plane,
-                center,
-            )  # fmt: skip
+        count, band, inner, share = _grow_loop(
+            features.arrays, labels, self._refining, self._polishing, self._mark, self._room, self._joined,
+            self._numbers, plane, center,
+        )  # fmt: skip
+        rows, layer = self._room[2, :count].copy(), self._room[3, :inner]
         if inner == 0 or share < options.min_share:
             return None, plane, rows
-        layer = self._room[3, :inner]
         alarm = self._log10_false_alarms(plane, rows)
         if alarm > np.log10(options.max_false_alarms):
             return None, plane, rows
