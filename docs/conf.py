@@ -62,7 +62,17 @@ napoleon_preprocess_types = False
 html_theme = "furo"
 html_math_renderer = "drawn"
 html_title = f"groma {release}"
-exclude_patterns = ["_build"]
+html_static_path = ["_static"]
+html_css_files = ["versions.css"]
+html_js_files = ["versions.js"]
+templates_path = ["_templates"]
+# The theme's sidebar, with a choice of versions where the site has several (packaging/publish_documentation.py).
+_PARTS = ("brand", "search", "scroll-start", "navigation", "scroll-end", "variant-selector")
+html_sidebars = {"**": [f"sidebar/{part}.html" for part in _PARTS]}
+html_sidebars["**"].insert(2, "versions.html")
+#: The folder of the site that these pages go to: a release, or a branch.
+html_context = {"published_as": os.environ.get("GROMA_DOCUMENTATION", release).removeprefix("v")}
+exclude_patterns = ["_build", "_templates"]
 
 #: What an array type is made of, and a name that Python defers, where the aliases above do not reach: inside others.
 _ARRAY = re.compile(

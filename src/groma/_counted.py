@@ -4,11 +4,17 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 
 def counted(count: int, plural: str) -> str:
     """Return for example ``22,106 points`` or ``1 image``."""
     return f"{count:,} {plural.removesuffix('s') if count == 1 else plural}"
+
+
+def first_of(names: Sequence[str], most: int) -> str:
+    """Return the first names of a list and how many more there are, for example ``a, b, c and 4 more``."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most:,} more" if len(names) > most else "")
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:

@@ -7,7 +7,8 @@ import pytest
 
 from groma.errors import FileFormatError, InputError, OutputError
 from groma.geometry import quaternion, se3
-from groma.io.g2o import looks_like_g2o, read_g2o, write_g2o
+from groma.io import read_scene
+from groma.io.g2o import is_g2o, looks_like_g2o, read_g2o, write_g2o
 
 SPACE = """# two poses
 PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1
@@ -125,3 +126,45 @@ def test_a_cut_archive_and_a_missing_file_are_refused(tmp_path):
 def test_first_bytes_tell_a_pose_graph():
     assert looks_like_g2o(SPACE.split("\n", 1)[1].encode()) and looks_like_g2o(PLANE.encode())
     assert not looks_like_g2o(b"16 22106 83718\n")
+
+
+def test_planar_graphs_of_toro_hold_the_same(tmp_path):
+    toro = "VERTEX2 0 0 0 0\nVERTEX2 1 1 2 0.5\nEDGE2 0 1 1 2 0.5 4 1 5 16 2 3\n"  # xx xy yy aa xa ya
+    read = read_g2o(file_with(tmp_path, toro, "graph.graph"))
+    same = read_g2o(file_with(tmp_path, PLANE.replace("4 1 0 4 0 16", "4 1 2 5 3 16")))
+    assert read.planar
+    np.testing.assert_array_equal(read.poses.world_from_body, same.poses.world_from_body)
+    np.testing.assert_array_equal(read.motions.information, same.motions.information)
+
+
+def test_graphs_of_toro_in_space_hold_the_same(rng, tmp_path):
+    """Roll, pitch, yaw are angles about x, y, z, the last outermost; the information is of whole angles."""
+    place, (roll, pitch, yaw) = rng.normal(size=3), rng.normal(size=3)
+    about = [np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]]) for a in (roll, pitch, yaw)]
+    turn = np.roll(about[2], (2, 2), (0, 1)) @ np.roll(about[1], (1, 1), (0, 1)) @ about[0]
+    root = rng.normal(size=(6, 6))
+    full = root.T @ root
+    six = " ".join(map(repr, map(float, [*place, roll, pitch, yaw])))
+    upper = " ".join(map(repr, map(float, full[np.triu_indices(6)])))
+    graph = read_g2o(
+        file_with(tmp_path, f"VERTEX3 0 0 0 0 0 0 0\nVERTEX3 1 {six}\nEDGE3 0 1 {six} {upper}\nEDGE3 0 1 {six}\n")
+    )
+    expected = np.vstack([np.c_[turn, place], [0, 0, 0, 1]])
+    for pose in (graph.poses.world_from_body[1], *graph.motions.first_from_second):
+        np.testing.assert_allclose(se3.to_matrix(pose), expected, atol=1e-14)
+    np.testing.assert_allclose(graph.motions.information, [full, np.eye(6)], rtol=1e-14)
+
+
+@pytest.mark.parametrize("text", [SPACE, PLANE, "EDGE3 0 1 0 0 0 0 0 0\n"])
+@pytest.mark.parametrize("name", ["graph.txt", "graph.gz", "graph.g2o"])
+def test_content_tells_a_pose_graph(tmp_path, text, name):
+    assert is_g2o(file_with(tmp_path, text, name))
+
+
+def test_other_files_are_no_pose_graphs(tmp_path):
+    assert not is_g2o(file_with(tmp_path, "16 22106 83718\n", "bal.txt"))
+    assert not is_g2o(tmp_path) and not is_g2o(tmp_path / "none.txt")
+    (tmp_path / "cut.gz").write_bytes(b"\x1f\x8b\x08")
+    assert not is_g2o(tmp_path / "cut.gz")
+    with pytest.raises(FileFormatError, match=r"is a pose graph, not a scene\. Optimise it with groma adjust"):
+        read_scene(file_with(tmp_path, PLANE, "graph.txt"))

@@ -234,6 +234,50 @@ def test_seven_scenes(tmp_path):
     assert offset[0, 0] > 0.025
 
 
+# -------------------------------------------------------------------------------------- Colour and depth, no lists
+
+
+def test_color_and_depth_by_number(tmp_path):
+    for number in (1, 2, 10):
+        image(tmp_path / f"color/{number}.jpg", 10 * number)
+    for number in (2, 1):
+        image(tmp_path / f"depth/d_{number:04d}.png", 1000 * number, dtype=np.uint16)
+    with pytest.raises(InputError, match="no camera is known"):
+        open_sequence(tmp_path)
+    sequence = open_sequence(tmp_path, camera="50 50 32 24")
+    frames = list(sequence)
+    assert sequence.kind == "rgbd" and [frame.name for frame in frames] == ["1.jpg", "2.jpg", "10.jpg"]
+    assert [None if frame.depth is None else frame.depth[0, 0] for frame in frames] == [1.0, 2.0, None]
+    assert "1000 is taken for a metre. Pass --depth-scale" in sequence.warnings[0]
+    assert sequence.warnings[1:] == ["10.jpg has no depth image."]
+    said = open_sequence(tmp_path, camera="50 50 32 24", depth_scale=500)
+    assert next(iter(said)).depth[0, 0] == 2.0 and not said.warnings
+    assert open_sequence(tmp_path, camera="50 50 32 24", kind="mono").warnings == []
+
+
+def test_color_and_depth_by_time(tmp_path):
+    for name in ("1.50", "1.25"):
+        image(tmp_path / f"rgb/{name}.png", 1)
+    image(tmp_path / "depth/1.255.png", 5000, dtype=np.uint16)
+    frames = list(open_sequence(tmp_path, camera="50 50 32 24"))
+    assert [(frame.timestamp, frame.depth is None) for frame in frames] == [(1.25, False), (1.5, True)]
+    assert frames[0].depth[0, 0] == 1.0  # as TUM writes depth
+
+
+def test_depth_in_floats_is_metres(tmp_path):
+    image(tmp_path / "image/7.png", 1)
+    image(tmp_path / "depth/7.tiff", 2.5, dtype=np.float32)
+    sequence = open_sequence(tmp_path, camera="50 50 32 24")
+    assert next(iter(sequence)).depth[0, 0] == 2.5 and not sequence.warnings
+
+
+def test_color_and_depth_that_do_not_belong_together(tmp_path):
+    image(tmp_path / "rgb/1.png", 1)
+    image(tmp_path / "depth/2.png", 1, dtype=np.uint16)
+    with pytest.raises(InputError, match="has the number or time of a depth image"):
+        open_sequence(tmp_path, camera="50 50 32 24")
+
+
 # -------------------------------------------------------------------------------------------------- Folders, videos
 
 

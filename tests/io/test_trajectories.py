@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Trajectory files: round trips in the three formats, how a format is recognised, directions, damage, gzip."""
+"""Trajectory files: round trips in the formats, how a format is recognised, directions, damage, gzip."""
 
 import gzip
 
@@ -8,7 +8,7 @@ import pytest
 
 from groma.errors import FileFormatError, InputError, OutputError
 from groma.geometry import quaternion, se3
-from groma.io import Trajectory, read_trajectory, write_trajectory
+from groma.io import Trajectory, read_scene, read_trajectory, write_trajectory
 
 
 @pytest.fixture
@@ -18,7 +18,7 @@ def trajectory():
     return Trajectory(1.4e9 + np.arange(7) * 0.05, np.hstack([turns, rng.standard_normal((7, 3))]))
 
 
-@pytest.mark.parametrize("format", ["tum", "kitti", "euroc"])
+@pytest.mark.parametrize("format", ["tum", "kitti", "euroc", "log"])
 def test_round_trip(trajectory, tmp_path, format):
     path = tmp_path / "t.txt"
     write_trajectory(trajectory, path, format)
@@ -27,7 +27,7 @@ def test_round_trip(trajectory, tmp_path, format):
         np.testing.assert_allclose(
             se3.to_matrix(read.world_from_cam), se3.to_matrix(trajectory.world_from_cam), rtol=0, atol=1e-14
         )
-        times = np.arange(7.0) if format == "kitti" else trajectory.timestamps
+        times = np.arange(7.0) if format in ("kitti", "log") else trajectory.timestamps
         np.testing.assert_allclose(read.timestamps, times, rtol=0, atol=1e-6)  # 64 bits of seconds since 1970
     packed = tmp_path / "t.gz"
     packed.write_bytes(gzip.compress(path.read_bytes()))
@@ -65,7 +65,7 @@ def test_nanoseconds_separated_by_spaces_are_not_euroc(tmp_path):
     ("text", "words"),
     [
         ("", "no pose"),
-        ("1 2 3\n", "got 3 words"),
+        ("1.5 2 3\n", "got 3 words"),
         ("0 0 0 0 0 0 0 0\n", "unit length"),
         ("0 0 0 0 0 0 0 1\n1 2\n", "line 2"),
         ("1 0 0 0 0 1 0 0 0 0 -1 0\n", "not a rotation"),
@@ -90,3 +90,30 @@ def test_unknown_formats_and_files(trajectory, tmp_path):
     (tmp_path / "t").write_bytes(b"\x1f\x8bnot gzip")
     with pytest.raises(FileFormatError):
         read_trajectory(tmp_path / "t")
+
+
+LOG = "0 0 0\n0 -1 0 4\n1 0 0 5\n0 0 1 6\n0 0 0 1\n"
+
+
+def test_matrices_of_redwood(tmp_path):
+    (tmp_path / "t.log").write_text(LOG + LOG.replace("0 0 0\n", "1 1 2\n", 1))
+    read = read_trajectory(tmp_path / "t.log")
+    np.testing.assert_allclose(read.world_from_cam, [[0, 0, np.sqrt(0.5), np.sqrt(0.5), 4, 5, 6]] * 2, atol=1e-15)
+    assert read.timestamps.tolist() == [0, 1]
+    with pytest.raises(FileFormatError, match="is not a scene"):  # three whole numbers begin BAL files, too
+        read_scene(tmp_path / "t.log")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (LOG[:-9], "expected 5 lines for each pose; got 4"),
+        (LOG.replace("0 0 0\n", "0 0.5 0\n", 1), "line 1: expected three whole numbers"),
+        (LOG.replace("0 0 0 1", "0 0 1 1"), "line 5: the last row"),
+        (LOG.replace("1 0 0 5", "2 0 0 5"), "line 2: the first three columns are not a rotation"),
+    ],
+)
+def test_damaged_matrices_are_refused(tmp_path, text, message):
+    (tmp_path / "t.log").write_text(text)
+    with pytest.raises(FileFormatError, match=message):
+        read_trajectory(tmp_path / "t.log", "log")

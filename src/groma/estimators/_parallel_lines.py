@@ -78,6 +78,10 @@ class ParallelGates:
         return self.freedom * ((1.0 - share) ** (-2.0 / self.freedom) - 1.0)
 
 
+#: The numbers in use.
+PARALLEL = ParallelGates()
+
+
 @dataclass(frozen=True)
 class Acceptance:
     """When a direction is one."""
@@ -126,27 +130,26 @@ def parallel_lines(
     turned: FloatArray | None,
     candidates: FloatArray,
     wanted: Acceptance,
-    gates: ParallelGates,
 ) -> ParallelLines:
     """Find the directions that lines share; ``turned`` None: ends do not deviate. The rest is said in the module."""
-    px = np.zeros(1) if turned is None else np.concatenate([[gates.start_px, 0.0], gates.deviations])
+    px = np.zeros(1) if turned is None else np.concatenate([[PARALLEL.start_px, 0.0], PARALLEL.deviations])
     turned = np.zeros(len(directions)) if turned is None else turned
-    noise = [(angle, one) for angle in np.geomspace(gates.looser * sigma, sigma, gates.angles) for one in px]
+    noise = [(angle, one) for angle in np.geomspace(PARALLEL.looser * sigma, sigma, PARALLEL.angles) for one in px]
     pools = map_in_threads(lambda one: Parallel.of(directions, covariance, np.hypot(one[0], one[1] * turned)), noise)
-    guesses = directions[np.argsort(pools[0].area, kind="stable")[: gates.max_candidates]]
+    guesses = directions[np.argsort(pools[0].area, kind="stable")[: PARALLEL.max_candidates]]
     guesses = np.concatenate([guesses, candidates])
-    found = _search(pools[0], guesses, wanted, gates)
-    best = _most_likely(pools, found, gates) if len(found.vectors) else len(pools) - len(px)
+    found = _search(pools[0], guesses, wanted)
+    best = _most_likely(pools, found) if len(found.vectors) else len(pools) - len(px)
     if best:
-        found = _search(pools[best], guesses, wanted, gates)
-    weight = found.probability * (gates.freedom + 2.0) / (gates.freedom + found.squared)
+        found = _search(pools[best], guesses, wanted)
+    weight = found.probability * (PARALLEL.freedom + 2.0) / (PARALLEL.freedom + found.squared)
     spread = [_covariance(pools[best], one, vector) for one, vector in zip(weight, found.vectors, strict=True)]
     nothing = np.zeros((1, len(directions)))
     label = np.concatenate([found.probability, nothing]).argmax(axis=0)
     mine = label, np.arange(len(label))
     squared = np.concatenate([found.squared, nothing])[mine]
     # Student's distribution is normal with a variance of its own for each line: its factor, if the residual tells it.
-    factor = np.maximum((gates.freedom + squared) / (gates.freedom + 2.0), 1.0)
+    factor = np.maximum((PARALLEL.freedom + squared) / (PARALLEL.freedom + 2.0), 1.0)
     angle, deviation = noise[best]
     beyond = (factor - 1.0) * pools[best].area + angle**2 - sigma**2
     beyond = np.divide(beyond, turned**2, out=np.zeros(len(label)), where=turned > 0.0)
@@ -161,31 +164,29 @@ def parallel_lines(
     )
 
 
-def _search(pool: Parallel, guesses: FloatArray, wanted: Acceptance, gates: ParallelGates) -> _Found:
+def _search(pool: Parallel, guesses: FloatArray, wanted: Acceptance) -> _Found:
     """Find the directions of lines among guesses (H, 3)."""
     found, share, evidence = np.zeros((0, 3)), np.zeros(0), []
-    members = _members(pool, guesses, gates)
+    members = _members(pool, guesses)
     while len(found) < wanted.most and len(pool) >= max(wanted.least, 2):
         far = (np.abs(guesses @ found.T) < math.cos(wanted.apart)).all(axis=1)
-        best = _best(pool, (guesses[far], members[far]), (found, share), wanted, gates)
+        best = _best(pool, (guesses[far], members[far]), (found, share), wanted)
         if best is None:
             break
         direction, part, factor = best
-        found, share, _, _ = _settled(
-            pool, np.vstack([found, direction]), np.append(share * (1.0 - part), part), False, gates
-        )
+        found, share, _, _ = _settled(pool, np.vstack([found, direction]), np.append(share * (1.0 - part), part), False)
         evidence.append(factor)
-    found, _, probability, squared = _settled(pool, found, share, True, gates)
+    found, _, probability, squared = _settled(pool, found, share, True)
     return _Found(found, np.array(evidence), probability, squared)
 
 
-def _most_likely(pools: list[Parallel], found: _Found, gates: ParallelGates) -> int:
+def _most_likely(pools: list[Parallel], found: _Found) -> int:
     """Which of several pools of the same lines, with other noise, is the likeliest with these directions."""
     none = 1.0 - found.probability.sum(axis=0, keepdims=True)
     share = np.maximum(np.concatenate([found.probability, none]).mean(axis=1, keepdims=True), 1e-12)
 
     def likelihood(pool: Parallel) -> float:
-        parts = np.vstack([_members(pool, found.vectors, gates), _anywhere(pool)])
+        parts = np.vstack([_members(pool, found.vectors), _anywhere(pool)])
         return float(_log_sum(np.log(share) + parts).sum())
 
     return int(np.argmax(map_in_threads(likelihood, pools)))
@@ -202,38 +203,34 @@ def _anywhere(pool: Parallel) -> FloatArray:
     return np.full((1, len(pool)), -math.log(2.0 * math.pi))
 
 
-def _members(pool: Parallel, vectors: FloatArray, gates: ParallelGates) -> FloatArray:
+def _members(pool: Parallel, vectors: FloatArray) -> FloatArray:
     """Logarithm (D, N) of the densities of lines along directions."""
-    bent = np.log1p(pool.squared(vectors) / gates.freedom)
-    return -0.5 * (gates.freedom + 2.0) * bent - np.log(2.0 * math.pi * pool.area)
+    bent = np.log1p(pool.squared(vectors) / PARALLEL.freedom)
+    return -0.5 * (PARALLEL.freedom + 2.0) * bent - np.log(2.0 * math.pi * pool.area)
 
 
-def _nearly(pool: Parallel, vectors: FloatArray, gates: ParallelGates) -> FloatArray:
+def _nearly(pool: Parallel, vectors: FloatArray) -> FloatArray:
     """Logarithm (D, N) of the densities of lines that are nearly along directions."""
-    variance = gates.nearly**2 + pool.area
+    variance = PARALLEL.nearly**2 + pool.area
     return -0.5 * (1.0 - (vectors @ pool.directions.T) ** 2) / variance - np.log(2.0 * math.pi * variance)
 
 
-def _across(pool: Parallel, vectors: FloatArray, gates: ParallelGates) -> FloatArray:
+def _across(pool: Parallel, vectors: FloatArray) -> FloatArray:
     """Logarithm (D, N) of the densities of lines anywhere on the circles perpendicular to directions."""
     variance = ((vectors @ np.swapaxes(pool.whitened, 1, 2)) ** 2 / (pool.whitened**2).sum(axis=2)[:, None] ** 2).sum(
         axis=2
     )
-    bent = np.log1p((vectors @ pool.directions.T) ** 2 / variance.T / gates.freedom)
+    bent = np.log1p((vectors @ pool.directions.T) ** 2 / variance.T / PARALLEL.freedom)
     scale = (
-        scipy.special.gammaln(0.5 * (gates.freedom + 1.0))
-        - scipy.special.gammaln(0.5 * gates.freedom)
+        scipy.special.gammaln(0.5 * (PARALLEL.freedom + 1.0))
+        - scipy.special.gammaln(0.5 * PARALLEL.freedom)
         - math.log(math.pi)
     )
-    return scale - 0.5 * (gates.freedom + 1.0) * bent - 0.5 * np.log(gates.freedom * math.pi * variance.T)
+    return scale - 0.5 * (PARALLEL.freedom + 1.0) * bent - 0.5 * np.log(PARALLEL.freedom * math.pi * variance.T)
 
 
 def _best(
-    pool: Parallel,
-    guessed: tuple[FloatArray, FloatArray],
-    found: tuple[FloatArray, FloatArray],
-    wanted: Acceptance,
-    gates: ParallelGates,
+    pool: Parallel, guessed: tuple[FloatArray, FloatArray], found: tuple[FloatArray, FloatArray], wanted: Acceptance
 ) -> tuple[FloatArray, float, float] | None:
     """Direction, share of the lines and evidence of the best new direction; None if none is one.
 
@@ -241,7 +238,7 @@ def _best(
     """
     (vectors, share), (guesses, members) = found, guessed
     log_share = np.log(np.append(share, max(1.0 - share.sum(), 1e-12)))[:, None]
-    before = _log_sum(log_share + np.vstack([_members(pool, vectors, gates), _anywhere(pool)]))
+    before = _log_sum(log_share + np.vstack([_members(pool, vectors), _anywhere(pool)]))
 
     def gains(rows: slice) -> tuple[FloatArray, FloatArray]:
         ratio = np.exp(np.minimum(members[rows] - before, 600.0))
@@ -256,12 +253,12 @@ def _best(
     part, gain = np.concatenate(parts), np.concatenate(sums)
     best, tried = None, np.zeros((0, 3))
     for k in np.argsort(-gain, kind="stable"):
-        if len(tried) == gates.max_refined:
+        if len(tried) == PARALLEL.max_refined:
             break
         if (np.abs(tried @ guesses[k]) > math.cos(wanted.apart)).any():
             continue
         tried = np.vstack([tried, guesses[k]])
-        refined = _refined(pool, before, guesses[k], float(part[k, 0]), wanted, gates)
+        refined = _refined(pool, before, guesses[k], float(part[k, 0]), wanted)
         new = refined is not None and (np.abs(vectors @ refined[0]) < math.cos(wanted.apart)).all()
         if refined is not None and new and (best is None or refined[2] > best[2]):
             best = refined
@@ -269,16 +266,16 @@ def _best(
 
 
 def _refined(
-    pool: Parallel, before: FloatArray, direction: FloatArray, part: float, wanted: Acceptance, gates: ParallelGates
+    pool: Parallel, before: FloatArray, direction: FloatArray, part: float, wanted: Acceptance
 ) -> tuple[FloatArray, float, float] | None:
     """The direction where it explains most, beside what was before; None if it is none."""
     mine, weight = np.zeros(len(pool)), np.zeros(len(pool))
     density = before
-    for _ in range(gates.rounds):
-        member = _members(pool, direction[None], gates)[0] + math.log(part)
+    for _ in range(PARALLEL.rounds):
+        member = _members(pool, direction[None])[0] + math.log(part)
         density = np.logaddexp(math.log1p(-part) + before, member)
         mine = np.exp(member - density)
-        weight = mine * (gates.freedom + 2.0) / (gates.freedom + pool.squared(direction[None])[0])
+        weight = mine * (PARALLEL.freedom + 2.0) / (PARALLEL.freedom + pool.squared(direction[None])[0])
         direction = _mean(pool, weight[None], direction[None])[0]
         part = float(np.clip(mine.mean(), 1e-12, 1.0 - 1e-12))
     variance = np.linalg.eigvalsh(_covariance(pool, weight, direction))[1:]
@@ -289,22 +286,22 @@ def _refined(
 
 
 def _settled(
-    pool: Parallel, vectors: FloatArray, share: FloatArray, with_more: bool, gates: ParallelGates
+    pool: Parallel, vectors: FloatArray, share: FloatArray, with_more: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Directions together: vectors, shares, and (D, N) probabilities and squared residuals of lines along them."""
     num = len(vectors)
     kinds = 1 + 2 * num * with_more
     others = np.full(kinds, max(1.0 - share.sum(), 1e-12) / kinds)
     shares, mine, squared = np.concatenate([share, others]), np.zeros((num, len(pool))), np.zeros((num, len(pool)))
-    for _ in range(gates.rounds if num else 0):
-        parts = [_members(pool, vectors, gates), _anywhere(pool)]
+    for _ in range(PARALLEL.rounds if num else 0):
+        parts = [_members(pool, vectors), _anywhere(pool)]
         if with_more:
-            parts += [_nearly(pool, vectors, gates), _across(pool, vectors, gates)]
+            parts += [_nearly(pool, vectors), _across(pool, vectors)]
         mixed = np.log(np.maximum(shares, 1e-300))[:, None] + np.vstack(parts)
         probability = np.exp(mixed - mixed.max(axis=0))
         probability /= probability.sum(axis=0)
         shares, mine, squared = probability.mean(axis=1), probability[:num], pool.squared(vectors)
-        weight = mine * (gates.freedom + 2.0) / (gates.freedom + squared)
+        weight = mine * (PARALLEL.freedom + 2.0) / (PARALLEL.freedom + squared)
         vectors = _mean(pool, weight, vectors)
     return vectors, shares[:num], mine, squared
 

@@ -29,7 +29,7 @@ import numpy as np
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.estimators._direction_features import Perpendicular, crossings
-from groma.estimators._parallel_lines import Acceptance, ParallelGates, parallel_lines
+from groma.estimators._parallel_lines import PARALLEL, Acceptance, parallel_lines
 from groma.estimators.association import log10_poisson_tail
 from groma.gates import chi_square_gate, gate
 from groma.geometry.algebra import dot, norm, perpendicular, unit, vectors
@@ -67,9 +67,8 @@ class DirectionGates:
     )
 
 
-#: The numbers in use, of normals and of lines.
+#: The numbers in use.
 DIRECTIONS = DirectionGates()
-PARALLEL = ParallelGates()
 
 
 @dataclass(frozen=True)
@@ -211,7 +210,7 @@ def directions_from_lines(
     sigma, bound = options.parallel_sigma, options.max_false_alarms
     apart = PARALLEL.same * sigma
     wanted = Acceptance(options.min_coincidences + 1, options.max_directions, options.max_sigma, apart, bound)
-    found = parallel_lines(unit(directions), covariance, sigma, turned, guesses, wanted, PARALLEL)
+    found = parallel_lines(unit(directions), covariance, sigma, turned, guesses, wanted)
     agrees = (found.probability > 0.5) & (found.squared < PARALLEL.quantile(options.level))
     return DirectionSet(
         found.vectors,

@@ -162,12 +162,7 @@ class SegmentRays:
 
 
 def trim(
-    segments: SegmentRays,
-    pointers: IntArray,
-    rows: IntArray,
-    active: BoolArray,
-    X: FloatArray,
-    gates: LineEndGates = LINE_ENDS,
+    segments: SegmentRays, pointers: IntArray, rows: IntArray, active: BoolArray, X: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
     """Return end points (L, 2, 3) of lines X where they end, and (M,) whether observations lie before their cameras.
 
@@ -179,7 +174,7 @@ def trim(
     def trim_some(part: slice) -> None:
         _trim_all(
             segments.center, segments.image, segments.ray, segments.length, pointers[part.start : part.stop + 1], rows,
-            active, numbers(gates), found[part], front,
+            active, numbers(LINE_ENDS), found[part], front,
         )  # fmt: skip
 
     map_ranges(trim_some, len(X), PROBLEMS_AT_ONCE)

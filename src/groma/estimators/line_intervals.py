@@ -20,7 +20,7 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._ordering import ascending, median, sort_by
 from groma._typing import FloatArray, IntArray
-from groma.estimators.line_ends import LINE_ENDS, LineEndGates
+from groma.estimators.line_ends import LINE_ENDS
 from groma.gates import numbers
 
 #: Images that must show a place of a line.
@@ -118,8 +118,7 @@ def _all_intervals(pointers, image, low, high, size, gates, begins, ends, count)
 
 
 def supported_intervals(
-    line_idx: IntArray, image_idx: IntArray, share: FloatArray, size: FloatArray, num_lines: int,
-    gates: LineEndGates = LINE_ENDS,
+    line_idx: IntArray, image_idx: IntArray, share: FloatArray, size: FloatArray, num_lines: int
 ) -> tuple[IntArray, FloatArray]:  # fmt: skip
     """Return the line (K,) and the shares (K, 2) of all supported intervals, in order; lines without any have none.
 
@@ -133,15 +132,13 @@ def supported_intervals(
         Length of a pixel along the line at each segment, in the same unit.
     num_lines : int
         Number of lines.
-    gates : LineEndGates, optional
-        Noise of ends, and majorities.
     """
     order = np.argsort(line_idx, kind="stable")
     pointers = np.searchsorted(line_idx[order], np.arange(num_lines + 1))
     begins, ends = np.zeros(len(order)), np.zeros(len(order))
     count = np.zeros(num_lines, np.int64)
     columns = (np.ascontiguousarray(column[order], np.float64) for column in (share[:, 0], share[:, 1], size))
-    _all_intervals(pointers, np.ascontiguousarray(image_idx[order]), *columns, numbers(gates), begins, ends, count)
+    _all_intervals(pointers, np.ascontiguousarray(image_idx[order]), *columns, numbers(LINE_ENDS), begins, ends, count)
     line = np.repeat(np.arange(num_lines), count)
     row = pointers[line] + np.arange(len(line)) - np.repeat(np.cumsum(count) - count, count)
     return line, np.column_stack([begins[row], ends[row]])

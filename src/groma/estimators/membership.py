@@ -40,6 +40,10 @@ class MembershipGates:
     significance: float = gate(0.05, "probability", "to find a deviation where there is none", "convention: 5 %")
 
 
+#: The numbers in use.
+MEMBERSHIPS = MembershipGates()
+
+
 @dataclass(frozen=True)
 class Candidates:
     """N pairs of a feature and a structure that it may belong to."""
@@ -69,7 +73,7 @@ class Membership:
     deviation: FloatArray
 
 
-def memberships(found: Candidates, most: FloatArray, gates: MembershipGates = MembershipGates()) -> Membership:
+def memberships(found: Candidates, most: FloatArray) -> Membership:
     """Estimate how far members of structures deviate, and with which probability features are members.
 
     Parameters
@@ -78,19 +82,17 @@ def memberships(found: Candidates, most: FloatArray, gates: MembershipGates = Me
         Pairs of features and structures.
     most : (K,) float64
         Largest deviation that members of each structure may have; deviations down to a fiftieth are tried.
-    gates : MembershipGates
-        How they are estimated.
     """
     num, rows = len(most), np.flatnonzero(found.counted)
     if len(found.owner) == 0:
         return Membership(np.zeros(0), np.zeros(num))
-    shrink = np.concatenate([[0.0], np.geomspace(gates.least, 1.0, gates.tried)])
+    shrink = np.concatenate([[0.0], np.geomspace(MEMBERSHIPS.least, 1.0, MEMBERSHIPS.tried)])
     likelihood, shares = np.zeros((len(shrink), num)), []
     groups = int(found.group.max()) + 1
     for k, part in enumerate(shrink):
         density = _density(found, part * most[found.owner])
         share = maximise_shares(
-            density[rows], found.clutter[rows], found.group[rows], groups, gates.pooled, gates.rounds
+            density[rows], found.clutter[rows], found.group[rows], groups, MEMBERSHIPS.pooled, MEMBERSHIPS.rounds
         )  # fmt: skip
         shares.append(share)
         mixed = share[found.group] * density + (1.0 - share[found.group]) * found.clutter
@@ -98,7 +100,7 @@ def memberships(found: Candidates, most: FloatArray, gates: MembershipGates = Me
     best = likelihood.argmax(axis=0)
     gain = likelihood.max(axis=0) - likelihood[0]
     # Where the widest fits best nothing stands out from clutter, whatever it is.
-    best[(gain < 0.5 * chi_square_gate(gates.significance, 1)) | (best == len(shrink) - 1)] = 0
+    best[(gain < 0.5 * chi_square_gate(MEMBERSHIPS.significance, 1)) | (best == len(shrink) - 1)] = 0
     deviation = shrink[best] * most
     density = _density(found, deviation[found.owner])
     share = np.array(shares)[best[found.owner], found.group]

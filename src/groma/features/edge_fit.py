@@ -224,9 +224,7 @@ def _measure_all(image, ends, fit, gates, new_ends, sigma, strength):
 
 
 # --------------------------------------------------------------------------------------------------------- Public
-def measure_edges(
-    image: GrayImage, ends: FloatArray, fit: bool = True, gates: EdgeGates = EDGES
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def measure_edges(image: GrayImage, ends: FloatArray, fit: bool = True) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Direct segments by the gradient (darker side left), fit them to the grey levels, and rate them.
 
     Parameters
@@ -237,8 +235,6 @@ def measure_edges(
         Segments within about a pixel of the edges, pixels.
     fit : bool
         Whether the end points may move across the segment; otherwise only their order changes.
-    gates : EdgeGates
-        Numbers of the fit.
 
     Returns
     -------
@@ -253,5 +249,5 @@ def measure_edges(
     new_ends, sigma, strength = np.zeros_like(ends), np.zeros(len(ends)), np.zeros(len(ends))
     if len(ends):
         smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.8, borderType=cv2.BORDER_REPLICATE)
-        _measure_all(smooth, ends, fit, numbers(gates), new_ends, sigma, strength)
+        _measure_all(smooth, ends, fit, numbers(EDGES), new_ends, sigma, strength)
     return new_ends, sigma, strength

@@ -116,7 +116,7 @@ class OnnxDetector:
         return Segments(ends[rows], sigma[rows], strength[rows])
 
 
-def covered(ends: FloatArray, gates: NetworkGates = NETWORK) -> BoolArray:
+def covered(ends: FloatArray) -> BoolArray:
     """Tell which segments (N, 4), the longest first, lie on an earlier one that covers most of them."""
     start, way = ends[:, :2], ends[:, 2:] - ends[:, :2]
     length = np.maximum(np.linalg.norm(way, axis=1), 1e-9)
@@ -129,7 +129,7 @@ def covered(ends: FloatArray, gates: NetworkGates = NETWORK) -> BoolArray:
         at.append(np.einsum("ijk,ik->ij", away, along))
     low, high = np.minimum(*at), np.maximum(*at)
     shared = np.minimum(high, length[:, None]) - np.maximum(low, 0.0)
-    on = (far < gates.same) & (shared > gates.covered * length) & np.triu(np.ones_like(far, bool), 1)
+    on = (far < NETWORK.same) & (shared > NETWORK.covered * length) & np.triu(np.ones_like(far, bool), 1)
     return np.asarray(on.any(axis=0))
 
 
@@ -138,9 +138,9 @@ def covered(ends: FloatArray, gates: NetworkGates = NETWORK) -> BoolArray:
 _Tile = tuple[tuple[int, int, int, int], tuple[float, float, float, float]]
 
 
-def _tiles(shape: tuple[int, ...], size: tuple[int, int], gates: NetworkGates = NETWORK) -> list[_Tile]:
+def _tiles(shape: tuple[int, ...], size: tuple[int, int]) -> list[_Tile]:
     """Cut an image (H, W) into tiles for a network of a size (width, height)."""
-    parts = [_parts(shape[1 - axis], size[axis] * gates.max_scale, gates.overlap) for axis in range(2)]
+    parts = [_parts(shape[1 - axis], size[axis] * NETWORK.max_scale, NETWORK.overlap) for axis in range(2)]
     return [
         ((left, top, width, height), (core_x[0], core_y[0], core_x[1], core_y[1]))
         for left, width, core_x in parts[0]
@@ -172,14 +172,14 @@ def _clipped(ends: FloatArray, core: FloatArray) -> FloatArray:
     return np.hstack(parts)[kept]
 
 
-def _on_edges(gray: GrayImage, ends: FloatArray, gates: NetworkGates = NETWORK) -> tuple[FloatArray, ...]:
+def _on_edges(gray: GrayImage, ends: FloatArray) -> tuple[FloatArray, ...]:
     """Move segments across themselves to the strongest edge nearby; ends, deviations and strengths."""
     way = ends[:, 2:] - ends[:, :2]
     length = np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
     across = np.tile(np.column_stack([way[:, 1], -way[:, 0]]) / length, (1, 2))
     tried = [
         measure_edges(gray, ends + shift * across)
-        for shift in (0.0, *gates.shifts, *(-shift for shift in gates.shifts))
+        for shift in (0.0, *NETWORK.shifts, *(-shift for shift in NETWORK.shifts))
     ]
     moved, sigma, strength = (np.stack(column) for column in zip(*tried, strict=True))
     # A place where the fit failed counts as half as strong.
@@ -203,7 +203,7 @@ class _Network:
     scores: str
     offsets: str
 
-    def segments(self, gray: GrayImage, tile: _Tile, gates: NetworkGates = NETWORK) -> FloatArray:
+    def segments(self, gray: GrayImage, tile: _Tile) -> FloatArray:
         """Segments (N, 4) in the core of a tile, pixels of the image."""
         (left, top, width, height), core = tile
         part = gray[top : top + height, left : left + width]
@@ -211,7 +211,7 @@ class _Network:
         image = np.ones((1, *small.shape, self.channels), np.float32)
         image[0, :, :, :3] = small[:, :, None]
         scores, offsets = self._run(image)
-        row, column = np.nonzero(scores[0, :, :, 0] > gates.min_score)
+        row, column = np.nonzero(scores[0, :, :, 0] > NETWORK.min_score)
         cell = np.column_stack([column, row, column, row]) + 0.5 + offsets[0, row, column]
         rows, columns = scores.shape[1:3]
         ends = cell * np.tile([width / columns, height / rows], 2) + np.tile([left, top], 2)
@@ -255,7 +255,7 @@ def _network(file: str, content: str) -> _Network:
     return _checked(session, file)
 
 
-def _checked(session: Any, file: str, gates: NetworkGates = NETWORK) -> _Network:
+def _checked(session: Any, file: str) -> _Network:
     """Return what input and outputs of a session are called; InputError if they are of another form."""
     inputs, outputs = session.get_inputs(), session.get_outputs()
     last = {output.shape[-1]: output for output in outputs if len(output.shape) == 4}
@@ -269,9 +269,9 @@ def _checked(session: Any, file: str, gates: NetworkGates = NETWORK) -> _Network
             f"{file} is no detector of segments that is known: expected {_FORM}; got input {given or 'none'}, outputs "
             f"{made or 'none'}. Write an adapter as a detector of your own (docs/extending.md)."
         )
-    if shape[1] * shape[2] > gates.largest:
+    if shape[1] * shape[2] > NETWORK.largest:
         raise InputError(
-            f"{file} takes images of {shape[2]} x {shape[1]} pixels; expected at most {gates.largest} in all. Export "
+            f"{file} takes images of {shape[2]} x {shape[1]} pixels; expected at most {NETWORK.largest} in all. Export "
             "it for smaller ones: larger images are cut into tiles."
         )
     return _Network(session, file, inputs[0].name, (shape[2], shape[1]), shape[3], last[1].name, last[4].name)

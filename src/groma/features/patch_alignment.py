@@ -344,7 +344,6 @@ def align_templates(
     template_index: IntArray,
     pixels: FloatArray,
     shapes: FloatArray,
-    gates: PatchGates = PATCHES,
 ) -> Alignment:
     """Align templates to an image.
 
@@ -360,8 +359,6 @@ def align_templates(
         Where it is looked for, within a pixel or two, pixels.
     shapes : (N, 2, 2) float64
         Derivative of pixels in this image by pixels of the template, to about a fifth.
-    gates : PatchGates
-        Numbers of the alignment.
 
     Returns
     -------
@@ -382,7 +379,7 @@ def align_templates(
     found = np.zeros((len(pixels), 2))
     covariance, correlation = np.zeros((len(pixels), 2, 2)), np.zeros(len(pixels))
     _align_all(
-        smooth_image, templates.levels, templates.fractions, index, pixels, shapes, numbers(gates), found, covariance,
+        smooth_image, templates.levels, templates.fractions, index, pixels, shapes, numbers(PATCHES), found, covariance,
         correlation,
     )  # fmt: skip
     return Alignment(found, covariance, correlation)

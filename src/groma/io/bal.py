@@ -157,10 +157,11 @@ def bal_params(scene: Scene) -> tuple[FloatArray, FloatArray]:
 def looks_like_bal(head: bytes) -> bool:
     """Tell from the first bytes of a file, decompressed where needed, whether its first line holds three counts.
 
-    More numbers in it are a pose.
+    More numbers in it are a pose; so are three before a row of a matrix, where BAL has two indices and a pixel.
     """
-    words = (head.lstrip().splitlines() or [b""])[0].split(None, 3)
-    return len(words) == 3 and all(word.isdigit() for word in words)
+    first, second = (line.split(None, 3) for line in ([*head.lstrip().splitlines(), b"", b""])[:2])
+    counts = len(first) == 3 and all(word.isdigit() for word in first)
+    return counts and all(word.isdigit() for word in second[:2])
 
 
 def _recognise(path: Path, head: bytes) -> bool:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Pose graphs in the text format of g2o, plain or compressed by gzip.
+r"""Pose graphs in the text formats of g2o and TORO, plain or compressed by gzip.
 
 ====================  =============================================================================================
 ``VERTEX_SE3:QUAT``   id, x y z, qx qy qz qw: world_from_body
@@ -7,6 +7,10 @@ r"""Pose graphs in the text format of g2o, plain or compressed by gzip.
 ``VERTEX_SE2``        id, x y angle
 ``EDGE_SE2``          two ids, x y angle, and the upper triangle (6) of its information
 ``FIX``               ids of poses that are held
+``VERTEX2``           TORO: as ``VERTEX_SE2``
+``EDGE2``             TORO: two ids, x y angle, and the information as xx xy yy aa xa ya
+``VERTEX3``           TORO: id, x y z, roll pitch yaw
+``EDGE3``             TORO: two ids, x y z, roll pitch yaw, and perhaps the upper triangle of the information (else 1)
 ====================  =============================================================================================
 
 g2o states the rotation error of ``EDGE_SE3:QUAT`` as the vector part of a quaternion, which is half the angle. Here
@@ -14,11 +18,13 @@ errors are in radians, so the information is
 
 .. math:: \Sigma^{-1} = S\, \Sigma_{file}^{-1}\, S, \qquad S = \mathrm{diag}(1, 1, 1, \tfrac12, \tfrac12, \tfrac12) .
 
-Other readers take the numbers as they are, and thereby rotations for twice as certain as they were written.
+Other readers take the numbers as they are, and thereby rotations for twice as certain as they were written. TORO's
+angles are whole angles. Roll, pitch and yaw turn about x, then y, then z of the first body: ``R = R_z R_y R_x``.
 Lines with ``#`` and parameters of sensors (``PARAMS_...``) are passed over; other vertices and edges are refused.
 
 Reference: R. Kuemmerle, G. Grisetti, H. Strasdat, K. Konolige, W. Burgard, *g2o: a general framework for graph
-optimization*, ICRA 2011, and its ``EdgeSE3::computeError``.
+optimization*, ICRA 2011, and its ``EdgeSE3::computeError``. G. Grisetti, C. Stachniss, S. Grzonka, W. Burgard, *TORO*,
+openslam.org.
 """
 
 from __future__ import annotations
@@ -26,6 +32,7 @@ from __future__ import annotations
 import gzip
 import io
 import os
+import zlib
 from array import array
 from collections.abc import Iterable
 from pathlib import Path
@@ -43,9 +50,23 @@ from groma.scene.pose_graph import GraphPoses, Motions, PoseGraph
 
 #: Numbers after the tag.
 _NUMBERS = {"VERTEX_SE3:QUAT": 8, "EDGE_SE3:QUAT": 30, "VERTEX_SE2": 4, "EDGE_SE2": 11}
+#: The same of TORO, and the tag of g2o that holds the same.
+_TORO = {
+    "VERTEX2": (4, "VERTEX_SE2"),
+    "EDGE2": (11, "EDGE_SE2"),
+    "VERTEX3": (7, "VERTEX_SE3:QUAT"),
+    "EDGE3": (29, "EDGE_SE3:QUAT"),
+}
+#: Numbers of an edge of TORO in space that states no information (file format).
+_BARE_EDGE3 = 8
 #: Larger numbers are not exact as floating point (derived from the precision of doubles).
 _ID_LIMIT = 2.0**53
 _HALF_ANGLES = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
+#: What they do to each number of an upper triangle, and an upper triangle of the identity.
+_HALF_ANGLE_PAIRS = np.outer(_HALF_ANGLES, _HALF_ANGLES)[np.triu_indices(6)]
+_ONE = ["1" if row == column else "0" for row, column in zip(*np.triu_indices(6), strict=True)]
+#: First bytes that say what a file is (cost: time only).
+_HEAD_BYTES = 4096
 #: Coordinates of a planar motion within (rho, omega) (file format).
 _PLANAR = np.array([0, 1, 5])
 
@@ -92,7 +113,25 @@ def write_g2o(graph: PoseGraph, path: str | os.PathLike[str], force: bool = Fals
 
 def looks_like_g2o(head: bytes) -> bool:
     """Tell from the first bytes of a file, decompressed where needed, whether a pose graph begins there."""
-    return head.lstrip().split(b" ", 1)[0].decode("ascii", "replace") in (*_NUMBERS, "FIX", "PARAMS_SE3OFFSET")
+    lines = (line.split(None, 1) for line in head.splitlines())
+    tag = next((words[0].decode("ascii", "replace") for words in lines if words and words[0][:1] != b"#"), "")
+    return tag in (*_NUMBERS, *_TORO, "FIX") or tag.startswith("PARAMS_SE")
+
+
+def is_g2o(path: Path) -> bool:
+    """Tell whether a file holds a pose graph: by its name (.g2o, .g2o.gz), or by how it begins."""
+    if path.name.lower().endswith((".g2o", ".g2o.gz")):
+        return True
+    if not path.is_file():
+        return False
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+        if head[:2] == b"\x1f\x8b":
+            head = zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(head, _HEAD_BYTES)
+    except (OSError, zlib.error):
+        return False
+    return looks_like_g2o(head)
 
 
 def _rows_by_tag(path: Path) -> dict[str, array[float]]:
@@ -105,15 +144,39 @@ def _rows_by_tag(path: Path) -> dict[str, array[float]]:
         if tag == "FIX":
             rows.setdefault(tag, array("d")).extend(finite(words, place, "ids of poses"))
             continue
-        if tag not in _NUMBERS:
-            raise FileFormatError(f"{place}: {tag[:40]!r} is not read; a pose graph has {', '.join(_NUMBERS)} and FIX.")
-        if len(words) != _NUMBERS[tag]:
-            raise FileFormatError(f"{place}: {tag} takes {_NUMBERS[tag]} numbers; got {len(words)}. Is it cut off?")
-        rows.setdefault(tag, array("d")).extend(finite(words, place, f"{_NUMBERS[tag]} finite numbers after {tag}"))
+        expected = _NUMBERS.get(tag) or _TORO.get(tag, (0, ""))[0]
+        if not expected:
+            known = ", ".join((*_NUMBERS, *_TORO))
+            raise FileFormatError(f"{place}: {tag[:40]!r} is not read; a pose graph has {known} and FIX.")
+        if tag == "EDGE3" and len(words) == _BARE_EDGE3:
+            words = [*words, *_ONE]
+        if len(words) != expected:
+            raise FileFormatError(f"{place}: {tag} takes {expected} numbers; got {len(words)}. Is it cut off?")
+        rows.setdefault(tag, array("d")).extend(finite(words, place, f"{expected} finite numbers after {tag}"))
     return rows
 
 
+def _without_toro(rows: dict[str, array[float]]) -> dict[str, array[float]]:
+    """Return rows with those of TORO as g2o writes them, behind g2o's own."""
+    result = {tag: values for tag, values in rows.items() if tag not in _TORO}
+    for tag, (width, same) in _TORO.items():
+        if tag not in rows:
+            continue
+        table = np.array(rows[tag]).reshape(-1, width)
+        if tag == "EDGE2":
+            table = table[:, [0, 1, 2, 3, 4, 5, 6, 9, 7, 10, 8]]
+        elif tag in ("VERTEX3", "EDGE3"):
+            angle = 4 if tag == "VERTEX3" else 5  # behind one id or two, and x y z
+            roll, pitch, yaw = (quaternion.exp(table[:, angle + k, None] * np.eye(3)[k]) for k in range(3))
+            turned = quaternion.multiply(yaw, quaternion.multiply(pitch, roll))
+            information = table[:, angle + 3 :] / (_HALF_ANGLE_PAIRS if tag == "EDGE3" else 1.0)
+            table = np.hstack([table[:, :angle], turned, information])
+        result.setdefault(same, array("d")).extend(table.ravel())
+    return result
+
+
 def _graph(rows: dict[str, array[float]], path: Path) -> PoseGraph:
+    rows = _without_toro(rows)
     planar = "VERTEX_SE2" in rows or "EDGE_SE2" in rows
     if planar and ("VERTEX_SE3:QUAT" in rows or "EDGE_SE3:QUAT" in rows):
         raise FileFormatError(f"{path} mixes poses of the plane (SE2) and of space (SE3); write two graphs.")

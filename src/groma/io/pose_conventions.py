@@ -69,6 +69,7 @@ BAL = PoseConvention("BAL", "cam_from_world", "axis and angle", "shift", "OpenGL
 TUM = PoseConvention("trajectory of TUM: time x y z qx qy qz qw", "world_from_cam", "qx qy qz qw", "camera centre")
 NAMED = PoseConvention("lines name x y z qx qy qz qw", "world_from_cam", "qx qy qz qw", "camera centre")
 KITTI = PoseConvention("trajectory of KITTI: 12 numbers", "world_from_cam", "matrix", "camera centre")
+LOG = PoseConvention("trajectory .log: Redwood, Open3D", "world_from_cam", "matrix", "camera centre")
 EUROC = PoseConvention(
     "trajectory of EuRoC: time, x, y, z, qw, qx, qy, qz", "world_from_cam", "qw qx qy qz", "camera centre"
 )
@@ -76,5 +77,5 @@ G2O = PoseConvention("g2o: VERTEX_SE3:QUAT id x y z qx qy qz qw", "world_from_ca
 
 #: All of them, as the documentation lists them.
 POSE_CONVENTIONS = (
-    COLMAP, TRANSFORMS, OPENSFM, OPENMVG, NVM, NVM_MATRIX, BUNDLER, BAL, NAMED, TUM, KITTI, EUROC, G2O,
+    COLMAP, TRANSFORMS, OPENSFM, OPENMVG, NVM, NVM_MATRIX, BUNDLER, BAL, NAMED, TUM, KITTI, LOG, EUROC, G2O,
 )  # fmt: skip

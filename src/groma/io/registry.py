@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from groma.errors import FileFormatError, InputError
+from groma.io.g2o import looks_like_g2o
 from groma.io.reading import existing, reading
 from groma.scene import Scene
 from groma.scene.checks import check_scene_given
@@ -114,6 +115,8 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
             return one.read(place)
     if place.is_dir() and (colmap := _FORMATS["colmap"].read) is not None:
         return colmap(place)  # it says what is missing in the folder
+    if looks_like_g2o(head):
+        raise FileFormatError(f"{place} is a pose graph, not a scene. Optimise it with groma adjust.")
     begin = f"begins with {head[:20].decode(errors='backslashreplace')!r}" if head else "is empty"
     raise FileFormatError(f"{place} is not a scene: expected {_sources(readable)}; it {begin}.")
 

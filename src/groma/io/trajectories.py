@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 # ruff: noqa: RUF009 - column() is dataclasses.field() with metadata
-"""Trajectories in the formats of TUM, KITTI and EuRoC, plain or compressed by gzip.
+"""Trajectories in the formats of TUM, KITTI, EuRoC and Redwood, plain or compressed by gzip.
 
 =========  =====================================================================  =================================
 ``tum``    ``time tx ty tz qx qy qz qw``, separated by spaces                     seconds; world_from_cam
 ``kitti``  12 numbers, the rows of the 3x4 matrix world_from_cam                  no time: the number of the line
 ``euroc``  ``time, px, py, pz, qw, qx, qy, qz`` and more, separated by commas     nanoseconds; world_from_body
+``log``    a line of three whole numbers, then the rows of the 4x4 matrix         no time: the number of the pose;
+           world_from_cam (Redwood, Open3D, Tanks and Temples)                    world_from_cam
 =========  =====================================================================  =================================
 
 ``#`` starts a comment. All of them hold where the camera (or body) is, the inverse of the ``cam_from_world`` of scenes.
@@ -31,6 +33,9 @@ from groma.io.atomic import atomic_output
 from groma.io.pose_conventions import EUROC, KITTI, TUM
 from groma.io.reading import existing, reading
 from groma.scene.table import Table, column
+
+#: Lines of a pose in a .log: its numbers, and a matrix of 4x4.
+_LOG_LINES = 5
 
 #: Lines that hold something, with their numbers, one after the other.
 Rows = Iterable[tuple[int, str]]
@@ -94,7 +99,7 @@ def read_trajectory(
     path : path
         The file; it may be compressed by gzip.
     format : str
-        ``tum``, ``kitti`` or ``euroc``; ``auto`` looks at the first line that holds numbers.
+        ``tum``, ``kitti``, ``euroc`` or ``log``; ``auto`` looks at the first line that holds numbers.
     timestamps : (N,) float, optional
         Times of the poses of a KITTI file, seconds. Without them the pose in line i has time i.
 
@@ -180,8 +185,8 @@ def _recognise(path: Path, number: int, line: str) -> TrajectoryFormat:
         if known.fits(line):
             return known
     raise FileFormatError(
-        f"{path}, line {number}: expected 8 numbers (TUM), 12 (KITTI) or 8 and more separated by commas (EuRoC); "
-        f"got {len(_words(line))} words. Pass the format if this is not the first pose."
+        f"{path}, line {number}: expected 8 numbers (TUM), 12 (KITTI), 8 and more separated by commas (EuRoC) or 3 "
+        f"before a matrix (.log); got {len(_words(line))} words. Pass the format if this is not the first pose."
     )
 
 
@@ -221,7 +226,26 @@ def _read_euroc(path: Path, rows: Rows) -> Trajectory:
 
 def _read_kitti(path: Path, rows: Rows) -> Trajectory:
     table, lines = _numbers(path, rows, 12)
-    matrices = table.reshape(-1, 3, 4)
+    return _of_matrices(path, lines, table.reshape(-1, 3, 4))
+
+
+def _read_log(path: Path, rows: Rows) -> Trajectory:
+    text = list(rows)
+    if len(text) % _LOG_LINES:
+        raise FileFormatError(f"{path}: expected {_LOG_LINES} lines for each pose; got {len(text)}. Is it cut off?")
+    heads, lines = _numbers(path, text[::_LOG_LINES], 3)
+    matrices = _numbers(path, (row for at, row in enumerate(text) if at % _LOG_LINES), 4)[0].reshape(-1, 4, 4)
+    if (heads != np.floor(heads)).any():
+        wrong = lines[(heads != np.floor(heads)).any(axis=1)][0]
+        raise FileFormatError(f"{path}, line {wrong}: expected three whole numbers before each matrix.")
+    if (matrices[:, 3] != [0.0, 0.0, 0.0, 1.0]).any():
+        wrong = lines[(matrices[:, 3] != [0.0, 0.0, 0.0, 1.0]).any(axis=1)][0]
+        raise FileFormatError(f"{path}, line {wrong + 4}: the last row of a pose is 0 0 0 1.")
+    return _of_matrices(path, lines + 1, matrices[:, :3])
+
+
+def _of_matrices(path: Path, lines: IntArray, matrices: FloatArray) -> Trajectory:
+    """Return poses without times from world_from_cam, (N, 3, 4)."""
     # The nearest rotation: files hold six or seven digits.
     u, singular, vt = np.linalg.svd(matrices[:, :, :3])
     turned = u @ vt
@@ -229,7 +253,7 @@ def _read_kitti(path: Path, rows: Rows) -> Trajectory:
     if len(bad):
         raise FileFormatError(f"{path}, line {lines[bad[0]]}: the first three columns are not a rotation.")
     poses = np.hstack([KITTI.quaternions(turned), matrices[:, :, 3]])
-    return Trajectory(np.arange(len(table), dtype=float), poses)
+    return Trajectory(np.arange(len(poses), dtype=float), poses)
 
 
 def _lines(table: FloatArray) -> str:
@@ -245,6 +269,11 @@ def _write_kitti(trajectory: Trajectory) -> str:
     return _lines(se3.to_matrix(trajectory.world_from_cam)[:, :3].reshape(-1, 12))
 
 
+def _write_log(trajectory: Trajectory) -> str:
+    matrices = se3.to_matrix(trajectory.world_from_cam)
+    return "".join(f"{number} {number} 0\n{_lines(matrix)}" for number, matrix in enumerate(matrices))
+
+
 def _write_euroc(trajectory: Trajectory) -> str:
     pose = trajectory.world_from_cam
     times = [round(time * 1e9) for time in trajectory.timestamps.tolist()]
@@ -257,6 +286,13 @@ for _format in (
     TrajectoryFormat("tum", lambda line: "," not in line and len(_words(line)) == 8, _read_tum, _write_tum),
     TrajectoryFormat(
         "kitti", lambda line: "," not in line and len(_words(line)) == 12, _read_kitti, _write_kitti, False
+    ),
+    TrajectoryFormat(
+        "log",
+        lambda line: len(_words(line)) == 3 and all(word.isdigit() for word in _words(line)),
+        _read_log,
+        _write_log,
+        False,
     ),
     TrajectoryFormat("euroc", lambda line: "," in line and len(_words(line)) >= 8, _read_euroc, _write_euroc),
 ):

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import cv2
 
+from groma._counted import counted, first_of
 from groma.bounded.images import decoded
 from groma.bounded.names import IMAGES, VIDEOS, is_text
 from groma.bounded.text import shown
@@ -118,11 +119,13 @@ def check_number(folder: Path, names: Sequence[str], model: Scene | None, min_im
     """Check that there are images and points enough for a map, and that the folder has the images of the model."""
     if model is None:
         if len(names) < 3:
-            raise InputError(f"{folder} holds {_images(len(names))}; a map needs at least 3 that overlap. Take more.")
+            held = counted(len(names), "images")
+            raise InputError(f"{folder} holds {held}; a map needs at least 3 that overlap. Take more.")
         return
     if model.num_images < max(2, min_images):
+        posed = counted(model.num_images, "images")
         raise InputError(
-            f"The model has {_images(model.num_images)} with a pose; a map needs at least {max(2, min_images)} that "
+            f"The model has {posed} with a pose; a map needs at least {max(2, min_images)} that "
             "overlap. Pass a model with more, or none to have it made."
         )
     check_names(folder, names, model)
@@ -143,17 +146,9 @@ def images_left_out(names: Sequence[str], used: Sequence[str], model_given: bool
     left = sorted(set(names) - set(used))
     if not left:
         return []
-    more = "" if len(left) <= 3 else f" and {len(left) - 3} more"
     remedy = " They share too few points with the others: take images between them, or pass a --model."
     have = "has no pose in the model and was" if len(left) == 1 else "have no pose in the model and were"
-    return [
-        f"{len(left)} of {len(names)} images {have} not used: {', '.join(left[:3])}{more}."
-        f"{'' if model_given else remedy}"
-    ]
-
-
-def _images(number: int) -> str:
-    return f"{number} {'image' if number == 1 else 'images'}"
+    return [f"{len(left)} of {len(names)} images {have} not used: {first_of(left, 3)}.{'' if model_given else remedy}"]
 
 
 def _suggestion(folder: Path, names: Sequence[str], missing: list[str]) -> str:

@@ -47,9 +47,7 @@ class RigGates:
 GATES = RigGates()
 
 
-def rig_that_does_not_fit(
-    scene: Scene, problem: Problem, threads: int | None = None, gates: RigGates = GATES
-) -> str | None:
+def rig_that_does_not_fit(scene: Scene, problem: Problem, threads: int | None = None) -> str | None:
     """Return a sentence on rigs that the images contradict, and its remedy; None where they fit or there are none.
 
     Parameters
@@ -58,17 +56,15 @@ def rig_that_does_not_fit(
         The images with their rigs, and the problem made of them, at its minimum.
     threads : int, optional
         For the few steps with free cameras.
-    gates : RigGates
-        What counts.
     """
     on_rigs = [f for f in _seen(problem) if f.extrinsics is not None and f.extrinsics.group == SENSORS]
     if not on_rigs or SENSORS not in problem.variables:
         return None
     options, reference = (
-        SolverOptions(max_iterations=gates.max_iterations, threads=threads),
+        SolverOptions(max_iterations=GATES.max_iterations, threads=threads),
         scene.sensors.is_reference == 1,
     )
-    begun = with_loss(of_points(problem, gates.max_observations), Cauchy(1.0))
+    begun = with_loss(of_points(problem, GATES.max_observations), Cauchy(1.0))
     begun = solve(begun, options).problem
     before = median_px(_seen(begun), begun)
     if not before > 0.0:
@@ -77,13 +73,13 @@ def rig_that_does_not_fit(
     freed = solve(_with_free_sensors(begun, reference), options).problem if _is_held(sensors) else begun
     alone = solve(_with_free_images(freed, reference), options).problem
     on_rig, apart = (median_px(_seen(found), found) for found in (freed, alone))
-    if _explained(freed, alone, on_rig, apart) >= gates.share:
+    if _explained(freed, alone, on_rig, apart) >= GATES.share:
         return (
             "The cameras are not fixed to each other, or their images were not taken at the same moments: with a pose "
             f"for each image the median residual of points would fall from {before:.2f} to {apart:.2f} px. Map without "
             "the rig."
         )
-    if _explained(begun, freed, before, on_rig) < gates.share:
+    if _explained(begun, freed, before, on_rig) < GATES.share:
         return None
     moved = _moved(sensors.state, freed.variables[SENSORS].state)
     return (

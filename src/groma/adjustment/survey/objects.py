@@ -14,7 +14,7 @@ from fnmatch import fnmatchcase
 
 import numpy as np
 
-from groma._counted import counted
+from groma._counted import counted, first_of
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
@@ -215,8 +215,7 @@ def direction_table(scene: Scene, given: DirectionsFile, stated: float | None, n
     if not known.any():
         found = find(given.names, scene, given.source, DIRECTED)
     if missing := [given.names[row] for row in np.flatnonzero(~known)]:
-        more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
-        notes.append(f"{given.source}: not in the scene: {', '.join(missing[:3])}{more}.")
+        notes.append(f"{given.source}: not in the scene: {first_of(missing, 3)}.")
     in_world = np.where((found.kind == Kind.IMAGE)[:, None], given.in_world, given.vectors)
     return KnownDirections(
         found.kind[known], found.idx[known], in_world[known], given.vectors[known], np.radians(sigma[known])

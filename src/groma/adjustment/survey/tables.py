@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from groma._counted import counted
+from groma._counted import counted, first_of
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.survey.given import Survey
 from groma.adjustment.survey.names import nearest, require_some, rows_by_name, tell_partly
@@ -115,12 +115,10 @@ def tell_unknown(given: Places, rows: IntArray, known: Sequence[str], words: str
     if unknown:
         named = set(rows.tolist())
         free = [name for row, name in enumerate(known) if row not in named]
-        listed = [name + nearest(name, free) for name in unknown[:_LISTED]]
-        more = f" and {len(unknown) - _LISTED} more" if len(unknown) > _LISTED else ""
-        notes.append(f"{given.source}: {counted(len(unknown), 'positions')} of {words}: {', '.join(listed)}{more}.")
+        told = [name + nearest(name, free) for name in unknown[:_LISTED]] + unknown[_LISTED:]
+        notes.append(f"{given.source}: {counted(len(unknown), 'positions')} of {words}: {first_of(told, _LISTED)}.")
 
 
 def listed(names: Sequence[str], kind: str) -> str:
     """Return how many there are, and the first names."""
-    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-    return f"{counted(len(names), kind)}, {', '.join(names[:_LISTED])}{more}"
+    return f"{counted(len(names), kind)}, {first_of(names, _LISTED)}"

@@ -176,14 +176,15 @@ def adjust(
 
     Reads a scene, minimises the robust reprojection error over everything in it and writes the scene back. The input
     is never changed. LIMAP's structures beside a COLMAP model are read and written too, with what they hold besides.
-    What the data do not determine is said in words at the end. A pose graph (.g2o, .g2o.gz) is adjusted, too, and so is
-    a folder of parts (groma convert --parts), by one process or by all that mpiexec starts.
+    What the data do not determine is said in words at the end. A pose graph (g2o, TORO) is adjusted, too, and so is a
+    folder of parts (groma convert --parts), by one process or by all that mpiexec starts.
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.adjusting import Wanted, adjust_and_write
     from groma.cli.shared.input import check_inputs, refuse_idle
     from groma.cli.shared.parts import PartsWanted, adjust_parts_and_write, has_company, is_parts
-    from groma.cli.shared.pose_graph import adjust_graph_and_write, is_pose_graph
+    from groma.cli.shared.pose_graph import adjust_graph_and_write
+    from groma.io.g2o import is_g2o
 
     if linear_solver != "auto":
         _check_linear_solver(linear_solver)
@@ -204,7 +205,7 @@ def adjust(
     )
     if not in_parts:
         check_inputs(source, truth, *measured.files)
-    if is_pose_graph(source) and not in_parts:
+    if not in_parts and is_g2o(source):
         refused = {
             "--report": page, "--covariance": covariance, "--contributions": contributions, "--gauge": gauge,
             "--line-chart": line_chart, "--refine-intrinsics": refine_intrinsics, "--refine-rigs": refine_rigs,

@@ -10,11 +10,6 @@ from groma.cli.shared.sentences import spent
 from groma.errors import InputError
 
 
-def is_pose_graph(path: Path) -> bool:
-    """Tell by its name whether a file holds a pose graph: it ends in .g2o or .g2o.gz."""
-    return path.name.lower().endswith((".g2o", ".g2o.gz"))
-
-
 def adjust_graph_and_write(
     source: Path, output: Path | None, console: Console, force: bool, options: dict[str, Any], refused: dict[str, Any]
 ) -> dict[str, Any]:
@@ -36,7 +31,7 @@ def adjust_graph_and_write(
     for name, value in refused.items():
         if value:
             raise InputError(f"{name} is for scenes with images; {source} is a pose graph. Leave it out.")
-    if output is not None and not is_pose_graph(output):
+    if output is not None and not output.name.lower().endswith((".g2o", ".g2o.gz")):
         raise InputError(f"A pose graph is written as .g2o or .g2o.gz; got {output}.")
 
     from groma.adjustment.graphs.pose_graph import PoseGraphOptions, adjust_pose_graph

@@ -29,7 +29,7 @@ import numpy.typing as npt
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
 from groma.features.depth.noise import DepthNoise, as_depth, as_pinhole
-from groma.features.depth.regions import MAX_REGIONS, REGIONS, RegionGates, assign, block_sums, grow, join
+from groma.features.depth.regions import MAX_REGIONS, REGIONS, assign, block_sums, grow, join
 from groma.geometry.charts.plane_normal_offset import NormalOffsetPlane
 
 
@@ -90,7 +90,6 @@ def find_depth_planes(
     pinhole: npt.ArrayLike,
     noise: DepthNoise | None = None,
     options: PlaneSearchOptions | None = None,
-    gates: RegionGates = REGIONS,
 ) -> DepthPlanes:
     r"""Find the planes of a depth image.
 
@@ -110,8 +109,6 @@ def find_depth_planes(
         Errors of depth.
     options : PlaneSearchOptions, optional
         What counts as a plane.
-    gates : RegionGates
-        Numbers of the search.
 
     Returns
     -------
@@ -129,7 +126,7 @@ def find_depth_planes(
     curved surfaces are cut into planes.
     """
     image, camera = as_depth(depth), as_pinhole(pinhole)
-    noise, options = noise or DepthNoise(), _for_density(options or PlaneSearchOptions(), image, gates.min_count)
+    noise, options = noise or DepthNoise(), _for_density(options or PlaneSearchOptions(), image, REGIONS.min_count)
     step, size = options.step, max(options.block // options.step, 2)
     rows, columns = -(-image.shape[0] // step), -(-image.shape[1] // step)
     blocks = (-(-rows // size), -(-columns // size))
@@ -144,12 +141,12 @@ def find_depth_planes(
     cos_floor = math.cos(math.radians(options.angle_deg))
     limits = (float(options.gate), float(options.bend), cos_floor)
     found = grow(
-        sums, counts, numbers, limits, (float(gates.min_count), gates.flat, gates.turn), min_blocks, block_labels,
+        sums, counts, numbers, limits, (float(REGIONS.min_count), REGIONS.flat, REGIONS.turn), min_blocks, block_labels,
         regions, region_counts,
     )  # fmt: skip
     target = np.zeros(found, np.int64)
-    join(regions, region_counts, found, numbers, limits, (gates.looser, gates.turn), target)
-    return _refined(image, camera, noise, options, gates.inlier, block_labels, regions, region_counts, target)
+    join(regions, region_counts, found, numbers, limits, (REGIONS.looser, REGIONS.turn), target)
+    return _refined(image, camera, noise, options, REGIONS.inlier, block_labels, regions, region_counts, target)
 
 
 def _for_density(options: PlaneSearchOptions, image: npt.NDArray[np.float32], min_count: int) -> PlaneSearchOptions:

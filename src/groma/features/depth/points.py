@@ -61,11 +61,9 @@ def _depth_all(image, pixels, limits, out):
 # ------------------------------------------------------------------------------------------------------------- Public
 
 
-def depth_at(
-    image: npt.NDArray[np.float32], pixels: FloatArray, max_depth: float, gates: DepthPointGates = DEPTH_POINTS
-) -> FloatArray:
+def depth_at(image: npt.NDArray[np.float32], pixels: FloatArray, max_depth: float) -> FloatArray:
     """Depths (N,) at pixels (N, 2) of an image of 3 x 3 pixels at least; NaN where unknown, too far, or at a jump."""
     out = np.full(len(pixels), np.nan)
-    limits = float(gates.min_known), float(gates.jump), float(gates.jump_share), float(max_depth)
+    limits = float(DEPTH_POINTS.min_known), float(DEPTH_POINTS.jump), float(DEPTH_POINTS.jump_share), float(max_depth)
     _depth_all(np.ascontiguousarray(image), np.ascontiguousarray(pixels, np.float64), limits, out)
     return out

@@ -120,13 +120,7 @@ def _describe_all(gradient_u, gradient_v, ends, band_rows, step, max_samples, fa
 
 
 # --------------------------------------------------------------------------------------------------------- Public
-def describe(
-    image: npt.NDArray[np.generic],
-    segments: Segments,
-    band_rows: int = 5,
-    scale: float = 1.0,
-    gates: DescriptorGates = DESCRIPTORS,
-) -> Descriptors:
+def describe(image: npt.NDArray[np.generic], segments: Segments, band_rows: int = 5, scale: float = 1.0) -> Descriptors:
     """Gradient-band descriptors of segments.
 
     Parameters
@@ -140,8 +134,6 @@ def describe(
     scale : float
         Distance of the rows in pixels. To compare an image with one that shows things s times larger, describe the
         larger at scale s.
-    gates : DescriptorGates
-        Numbers of the description.
 
     Returns
     -------
@@ -158,7 +150,7 @@ def describe(
     gray = to_gray(image).astype(np.float32)
     raw = np.zeros((len(segments), DESCRIPTOR_SIZE), dtype=np.float64)
     if len(segments):
-        smooth = cv2.GaussianBlur(gray, (0, 0), max(scale, gates.min_blur), borderType=cv2.BORDER_REPLICATE)
+        smooth = cv2.GaussianBlur(gray, (0, 0), max(scale, DESCRIPTORS.min_blur), borderType=cv2.BORDER_REPLICATE)
         gradient_u = cv2.Scharr(smooth, cv2.CV_32F, 1, 0, borderType=cv2.BORDER_REPLICATE)
         gradient_v = cv2.Scharr(smooth, cv2.CV_32F, 0, 1, borderType=cv2.BORDER_REPLICATE)
         _describe_all(
@@ -167,14 +159,14 @@ def describe(
             segments.ends,
             band_rows,
             float(scale),
-            gates.max_samples,
-            gates.fade,
-            gates.overlap,
+            DESCRIPTORS.max_samples,
+            DESCRIPTORS.fade,
+            DESCRIPTORS.overlap,
             raw,
         )
     half = DESCRIPTOR_SIZE // 2
     parts = np.concatenate([_unit(raw[:, :half]), _unit(raw[:, half:])], axis=1)
-    return _unit(np.minimum(_unit(parts), gates.max_entry)).astype(np.float32)
+    return _unit(np.minimum(_unit(parts), DESCRIPTORS.max_entry)).astype(np.float32)
 
 
 def _unit(vectors: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -19,6 +19,7 @@ from groma.io.sequences.kitti import is_kitti, open_kitti
 from groma.io.sequences.layouts import SequenceLayout, Wishes, layouts, register_layout
 from groma.io.sequences.seven_scenes import open_seven_scenes, seven_scenes_root
 from groma.io.sequences.tum_rgbd import is_tum_rgbd, open_tum_rgbd
+from groma.io.sequences.two_folders import is_two_folders, open_two_folders
 
 
 def open_sequence(
@@ -36,7 +37,7 @@ def open_sequence(
     ----------
     path : path
         A folder of TUM RGB-D (``rgb.txt``), 7-Scenes (``frame-000000.color.png``), KITTI odometry (``image_0``) or
-        EuRoC (``mav0``), a folder of images, or a video file.
+        EuRoC (``mav0``), a folder with ``rgb`` or ``color`` and ``depth``, a folder of images, or a video file.
     camera : SequenceCamera, numbers, str or path, optional
         The camera that took the images, in place of what the folder says: ``fx fy cx cy [k1 k2 p1 p2 [k3]]`` as OpenCV
         counts (the first pixel's centre is (0, 0)), a line of COLMAP's ``cameras.txt`` (the first pixel's centre is
@@ -100,6 +101,10 @@ for _layout in (
     SequenceLayout(
         "seven_scenes", "frame-000000.color.png (7-Scenes)", seven_scenes_root,
         lambda path, w: open_seven_scenes(path, w.calibration, w.depth_scale, w.selection),
+    ),
+    SequenceLayout(
+        "two_folders", "rgb or color with depth", _here(is_two_folders),
+        lambda path, w: open_two_folders(path, w.calibration, w.depth_scale, w.selection),
     ),
     SequenceLayout("images", "", _here(image_files), lambda path, w: open_images(path, w.calibration, w.selection)),
 ):  # fmt: skip

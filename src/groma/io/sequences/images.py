@@ -29,7 +29,8 @@ from groma.io.trajectories import Trajectory, read_trajectory
 #: Frames a second where nothing says it (convention: usual for video).
 RATE = 30.0
 
-_NO_CAMERA = (
+#: What to do where no camera is known.
+NO_CAMERA = (
     "no camera is known for {path}. Pass one (--camera), such as 'fx fy cx cy', or the name of a file with a line of "
     "COLMAP's cameras.txt, or put it into cameras.txt beside the images."
 )
@@ -52,9 +53,9 @@ def open_images(folder: Path, calibration: Calibration | None, selection: Select
     images = image_files(folder)
     calibration = calibration or find_calibration(folder) or find_calibration(images[0].parent)
     if calibration is None:
-        raise InputError(_NO_CAMERA.format(path=folder))
-    entries = [Entry(time, path) for time, path in zip(_times(folder, images), images, strict=True)]
-    return simple_sequence(kind, selection.of(entries, warnings), calibration, _reference(folder), warnings)
+        raise InputError(NO_CAMERA.format(path=folder))
+    entries = [Entry(time, path) for time, path in zip(times_of(folder, images), images, strict=True)]
+    return simple_sequence(kind, selection.of(entries, warnings), calibration, reference_of(folder), warnings)
 
 
 def open_video(path: Path, calibration: Calibration | None, selection: Selection) -> VideoSequence:
@@ -62,7 +63,7 @@ def open_video(path: Path, calibration: Calibration | None, selection: Selection
     selection.kind_of("mono")
     calibration = calibration or find_calibration(path.parent)
     if calibration is None:
-        raise InputError(_NO_CAMERA.format(path=path))
+        raise InputError(NO_CAMERA.format(path=path))
     return VideoSequence(path, calibration, selection)
 
 
@@ -134,7 +135,8 @@ def _forever() -> Iterator[None]:
         yield None
 
 
-def _times(folder: Path, images: list[Path]) -> list[float]:
+def times_of(folder: Path, images: list[Path]) -> list[float]:
+    """Return the seconds of images; see the module."""
     for name in ("times.txt", "timestamps.txt"):
         path = folder / name
         if path.is_file():
@@ -151,6 +153,7 @@ def _times(folder: Path, images: list[Path]) -> list[float]:
     return [number / RATE for number in range(len(images))]
 
 
-def _reference(folder: Path) -> Trajectory | None:
+def reference_of(folder: Path) -> Trajectory | None:
+    """Return the trajectory in ``groundtruth.txt``, if it is there."""
     path = folder / "groundtruth.txt"
     return read_trajectory(path, "tum") if path.is_file() else None

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from groma._counted import counted
+from groma._counted import counted, first_of
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
 from groma.gates import gate
@@ -133,6 +133,5 @@ def say_left_out(used: BoolArray, names: Sequence[str]) -> list[str]:
     left = [name for name, one in zip(names, used, strict=True) if not one]
     if not left:
         return []
-    more = "" if len(left) <= 3 else f" and {len(left) - 3} more"
-    listed = ", ".join(left[:3]) + more
+    listed = first_of(left, 3)
     return [f"{len(left)} of {counted(len(names), 'photographs')} without a depth map, or with an empty one: {listed}."]

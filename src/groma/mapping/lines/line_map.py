@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from groma._counted import counted
 from groma._typing import FloatArray, IntArray
 from groma.mapping.lines.intervals import with_supported_intervals
 from groma.mapping.lines.outcomes import REMEDIES, WORDS, Outcome
@@ -94,7 +95,7 @@ def explain(line_map: LineMap, num_left_out: int = 0, min_confidence: float = 0.
             "length (--min-length) finds shorter ones."
         )
     mapped = counts[Outcome.MAPPED] + counts[Outcome.RECOVERED]
-    source = f"from {mapped:,} of {total:,} segments in {_images(len(line_map.outcomes))}"
+    source = f"from {mapped:,} of {total:,} segments in {counted(len(line_map.outcomes), 'images')}"
     head = f"{_lines(line_map.num_lines)} {source}."
     if num_left_out:
         head = (
@@ -115,10 +116,6 @@ def explain(line_map: LineMap, num_left_out: int = 0, min_confidence: float = 0.
 
 def _lines(number: int) -> str:
     return f"{number:,} {'line' if number == 1 else 'lines'}"
-
-
-def _images(number: int) -> str:
-    return f"{number} {'image' if number == 1 else 'images'}"
 
 
 def _percent(part: int, total: int) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from groma._counted import first_of
 from groma._typing import BoolArray, FloatArray
 from groma.evaluation.alignment import camera_centers
 from groma.geometry import quaternion
@@ -38,14 +39,13 @@ def about_gross_errors(
     angle = np.degrees(np.linalg.norm(quaternion.log(between), axis=1))
     each = [
         f"{names[row]} ({distance:.3g} units, {degrees:.3g} degrees off)"
-        for row, distance, degrees in zip(rows[:_NAMES].tolist(), apart, angle, strict=False)
+        for row, distance, degrees in zip(rows.tolist(), apart, angle, strict=True)
     ]
-    more = f" and {len(rows) - _NAMES} more" if len(rows) > _NAMES else ""
     if len(rows) == 1:
         return [f"The given pose of {each[0]} is wrong beyond its noise; the image was placed anew by its matches."]
     return [
         f"The given poses of {len(rows)} images are wrong beyond their noise; the images were placed anew by their "
-        f"matches: {', '.join(each)}{more}."
+        f"matches: {first_of(each, _NAMES)}."
     ]
 
 
@@ -54,9 +54,8 @@ def about_left_out(names: Sequence[str], seen: BoolArray) -> list[str]:
     rows = np.flatnonzero(~seen)
     if not len(rows):
         return []
-    listed = ", ".join([names[int(row)] for row in rows[:_NAMES]])
-    more = f" and {len(rows) - _NAMES} more" if len(rows) > _NAMES else ""
+    listed = first_of([names[int(row)] for row in rows], _NAMES)
     return [
         f"{len(rows)} of {len(seen)} images see too few points of the others for their poses to be checked, and were "
-        f"left out: {listed}{more}."
+        f"left out: {listed}."
     ]

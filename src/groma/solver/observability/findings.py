@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from groma._counted import first_of
 from groma.solver.observability.gates import DIAGNOSIS
 from groma.solver.observability.messages import listing
 
@@ -43,7 +44,7 @@ def few(parts: list[str], most: int = DIAGNOSIS.examples) -> str:
     """Return the first of a list in words, and how many more there are."""
     if len(parts) <= most:
         return listing(parts)
-    return f"{', '.join(parts[:most])} and {len(parts) - most:,} more"
+    return first_of(parts, most)
 
 
 def first_upper(text: str) -> str:

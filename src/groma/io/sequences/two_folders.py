@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Colour and depth in two folders without lists, as Open3D, ScanNet and recorders of depth cameras write them.
+
+Colour lies in ``rgb``, ``color``, ``image`` or ``images``, depth in ``depth``. Images whose names are seconds (as those
+of TUM RGB-D) are paired by time, others by the last number in their names.
+Numbers in files of integers are millimetres, or 1/5000 of a metre where names are seconds; floats are metres.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from groma._counted import counted, natural_key
+from groma.bounded.images import decoded
+from groma.bounded.names import IMAGES
+from groma.errors import FileFormatError, InputError
+from groma.io.sequences import tum_rgbd
+from groma.io.sequences._calibration import Calibration, find_calibration
+from groma.io.sequences._reader import Entry, FileSequence, Preparation, Selection, simple_sequence
+from groma.io.sequences.images import NO_CAMERA, reference_of, times_of
+
+#: Folders of colour, those that others are named after first (belongs to the format).
+COLOR = ("rgb", "color", "image", "images")
+#: Folder of depth (belongs to the format).
+DEPTH = "depth"
+#: Numbers in files of integers per metre (convention: millimetres).
+DEPTH_SCALE = 1000.0
+
+
+def is_two_folders(folder: Path) -> bool:
+    """Whether a folder has this layout."""
+    return bool(_images(folder / DEPTH)) and any(_images(folder / name) for name in COLOR)
+
+
+def open_two_folders(
+    folder: Path, calibration: Calibration | None, depth_scale: float | None, selection: Selection
+) -> FileSequence:
+    """Open a folder; see :func:`groma.io.sequences.open_sequence`."""
+    colors = next(found for name in COLOR if (found := _images(folder / name)))
+    depths = _images(folder / DEPTH)
+    calibration = calibration or find_calibration(folder) or find_calibration(colors[0].parent)
+    if calibration is None:
+        raise InputError(NO_CAMERA.format(path=folder))
+    warnings: list[str] = []
+    kind = selection.kind_of("rgbd")
+    pairs = _pairs(colors, depths)
+    entries = [
+        Entry(time, path, depths[pairs[row]] if row in pairs else None)
+        for row, (time, path) in enumerate(zip(times_of(folder, colors), colors, strict=True))
+    ]
+    if depth_scale is None:
+        depth_scale = _scale(depths)
+        if kind == "rgbd" and depth_scale != 1.0:
+            warnings.append(
+                f"Nothing in {folder} says the unit of the depth images; {depth_scale:g} is taken for a metre. Pass "
+                "--depth-scale (depth_scale=) if it is another."
+            )
+    preparation = Preparation(depth_scale=depth_scale)
+    return simple_sequence(
+        kind, selection.of(entries, warnings), calibration, reference_of(folder), warnings, preparation
+    )
+
+
+def _images(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    found = (path for path in folder.iterdir() if path.suffix.lower() in IMAGES and path.is_file())
+    return sorted(found, key=lambda path: natural_key(path.name))
+
+
+def _are_seconds(images: list[Path]) -> bool:
+    return all(re.fullmatch(r"\d+\.\d+", path.stem) for path in images)
+
+
+def _pairs(colors: list[Path], depths: list[Path]) -> dict[int, int]:
+    """Return the row of the depth image of each row of colour images."""
+    if _are_seconds(colors) and _are_seconds(depths):
+        first, second = (np.array([float(path.stem) for path in images]) for images in (colors, depths))
+        pairs = dict(tum_rgbd.pair_by_time(first, second))
+    else:
+        row_of = {_number(path): row for row, path in enumerate(depths)}
+        pairs = {row: row_of[_number(path)] for row, path in enumerate(colors) if _number(path) in row_of}
+    if not pairs:
+        raise InputError(
+            f"None of {counted(len(colors), 'colour images')}, such as {colors[0].name}, has the number or time of a "
+            f"depth image, such as {depths[0].name}. Name them alike, or list them in associations.txt."
+        )
+    return pairs
+
+
+def _number(path: Path) -> int | str:
+    digits = re.findall(r"\d+", path.stem)
+    return int(digits[-1][-18:]) if digits else path.stem
+
+
+def _scale(depths: list[Path]) -> float:
+    try:
+        first = decoded(depths[0].read_bytes(), cv2.IMREAD_UNCHANGED)
+    except (OSError, FileFormatError):
+        first = None
+    if first is not None and first.dtype.kind == "f":
+        return 1.0
+    return tum_rgbd.DEPTH_SCALE if _are_seconds(depths) else DEPTH_SCALE
