@@ -127,9 +127,9 @@ def _product_codegen(context, builder, signature, args, accumulate: bool):
 
 def _length(context, builder, kind, value):
     """Return the size that a width stands for."""
-    if isinstance(kind, types.BaseTuple):
-        return ir.Constant(_I64, kind.count)
-    return cgutils.unpack_tuple(builder, context.make_array(kind)(context, builder, value).shape)[0]
+    if isinstance(kind, types.Array):
+        return cgutils.unpack_tuple(builder, context.make_array(kind)(context, builder, value).shape)[0]
+    return ir.Constant(_I64, kind.count)
 
 
 def _product_by_numbers(context, builder, signature, args, accumulate: bool):

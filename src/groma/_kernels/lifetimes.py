@@ -37,15 +37,13 @@ def _process_on_demand(self: Any, emit_dels: bool = False, extend_lifetimes: boo
         self._insert_var_dels(extend_lifetimes=extend_lifetimes)
 
 
-def _variables(self: Any, value: Any) -> list[Any]:
+def _variables(self: Any, val: Any) -> list[Any]:
     """Take the place of :meth:`ir.Inst._rec_list_vars`: the variables in a value, in their order."""
-    kind = type(value)
-    if kind is dict:
-        value = value.values()
-    elif kind is not tuple and kind is not list:
-        return _list_variables(self, value)
+    kind = type(val)
+    if kind is not dict and kind is not tuple and kind is not list:
+        return _list_variables(self, val)
     found = []
-    for item in value:
+    for item in val.values() if kind is dict else val:
         kind = type(item)
         if kind is ir.Var:
             found.append(item)
