@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Localised photographs against the truth, beside the peers on the same matches.
 
-    python benchmarks/localize.py stairs DATA                     one query with given matches, 20 seeds, and peers
+    python benchmarks/localize.py stairs DATA                     one query with given matches, 20 seeds, and peers;
+                                                                  and what other features of it say
     python benchmarks/localize.py held-out MAP IMAGES TRUTH       photographs that are not in a map
 
 ``DATA`` is ``localization_stairs/query_1.npz``; ``TRUTH`` a scene with the poses of all photographs in ``IMAGES``. Maps
@@ -16,13 +17,18 @@ import json
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 
-from groma.geometry import quaternion, so3
+from groma.geometry import quaternion, se3, so3
 from groma.io import read_scene
+from groma.localization.features import find_features
+from groma.localization.line_matching import SeenLines, lines_near
 from groma.localization.localizer import LocalizeOptions, Localizer
 from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose
 from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.matches import Matches
+from groma.localization.pose.refinement import refine
 
 #: Shares of queries within these distances (metres) and angles (degrees) are told.
 LIMITS = ((0.01, 1.0), (0.02, 2.0), (0.05, 5.0))
@@ -63,6 +69,7 @@ def stairs(path: Path, seeds: int = 20) -> dict[str, object]:
         return estimate_absolute_pose(camera, *points, *more, options=PoseOptions(seed=seed)).cam_from_world
 
     told: dict[str, object] = {}
+    every = []
     for name, method in (
         ("groma, points", ours),
         ("groma, points and lines", lambda seed: ours(seed, *lines)),
@@ -75,6 +82,7 @@ def stairs(path: Path, seeds: int = 20) -> dict[str, object]:
         poses = [method(seed + 1) for seed in range(seeds)]
         seconds = (time.process_time() - start) / seeds
         errors = np.array([_errors(pose, true) for pose in poses if pose is not None])
+        every.append([pose for pose in poses if pose is not None][np.argsort(errors[:, 0])[len(errors) // 2]])
         told[name] = {
             "cm": 100 * float(np.median(errors[:, 0])),
             "deg": float(np.median(errors[:, 1])),
@@ -84,7 +92,35 @@ def stairs(path: Path, seeds: int = 20) -> dict[str, object]:
     told["stated cm"] = 100 * float(np.linalg.norm(found.center_sigma))
     told["stated deg"] = found.rotation_sigma_deg
     told["verdict"] = f"{found.status}: {found.sentence}"
+    difference = se3.log(se3.compose(true[None], se3.inverse(found.cam_from_world[None])))[0]
+    told["squared error, six degrees"] = float(difference @ np.linalg.solve(found.covariance, difference))
+    told["farthest pose of the others: cm, deg"] = _told(max(_errors(pose, found.cam_from_world) for pose in every))
+    gray = cv2.cvtColor(data["image_rgb"], cv2.COLOR_RGB2GRAY)
+    for name, start in (("the truth", true), ("the pose", found.cam_from_world)):
+        agree, pose = _by_all_lines(camera, gray, data["map_lines3d"], start)
+        told[f"segments of the photograph and all lines of the map, from {name}"] = {
+            "segments that agree": agree,
+            "cm, deg from the truth": _told(_errors(pose, true)),
+            "cm, deg from the pose": _told(_errors(pose, found.cam_from_world)),
+        }
     return told
+
+
+def _told(errors: tuple[float, float]) -> tuple[float, float]:
+    return 100.0 * errors[0], errors[1]
+
+
+def _by_all_lines(camera, gray, lines, pose, reach=12.0, rounds=6) -> tuple[int, np.ndarray]:
+    """A pose by segments found anew: of all lines of the map any that is within so many pixels may be theirs."""
+    found = find_features(gray, camera, True, 15.0).segments
+    alike = np.ones((len(lines), 1), np.float32)  # no descriptors: place and direction decide
+    seen = SeenLines(np.arange(len(lines)), alike, lines)
+    for _ in range(rounds):
+        line, segment = lines_near(camera, pose, seen, found, alike[: len(found)], reach).T
+        matches = Matches(segments2d=found.ends.reshape(-1, 2, 2)[segment], segments3d=lines[line]).with_sigma(1.0)
+        fit = refine(camera, matches, pose, (reach, reach))
+        pose = fit.pose
+    return int(fit.line_inliers.sum()), pose
 
 
 def _poselib(camera, points, lines, seed):

@@ -14,6 +14,7 @@ two, serial work in seconds of the processor time with two, and its share of all
 """
 
 import argparse
+import gc
 import json
 import os
 import resource
@@ -31,6 +32,7 @@ INTERVAL = 0.005
 def run(images, model, threads):
     """Map, diagnose and write as the command does; return when each stage began, with the processor time until then."""
     marks = []
+    gc.set_threshold(10_000)  # as the command does
 
     def mark(stage, *_):
         if not marks or marks[-1][2] != stage:

@@ -15,6 +15,8 @@ from groma.estimators.directions import (
 )
 from groma.geometry.so3 import exp
 
+pytestmark = pytest.mark.kernels
+
 FRAME = exp(np.array([0.3, -0.2, 0.5]))
 EXACT = DirectionOptions(parallel_sigma=1e-5)
 

@@ -81,6 +81,20 @@ def test_colmap_poses_are_those_of_pycolmap(tmp_path):
     assert {element.image_id for element in model.points3D[4].track.elements} == {10, 11, 12, 13, 20}
 
 
+def test_binary_models_are_the_files_that_pycolmap_writes(tmp_path):
+    """Points are written as arrays, all else by pycolmap; landmarks that no image sees and free 2D points, too."""
+    scene = rig_scene().points_only()
+    unseen = scene.point_observations.point_idx != 1
+    scene = scene.replace(point_observations=scene.point_observations.take(np.flatnonzero(unseen)))
+    assert len(scene.keypoints) > 0
+    for name, one in (("model", scene), ("none", scene.keep(points=[]))):
+        write_colmap(one, tmp_path / name)
+        (tmp_path / f"{name} by pycolmap").mkdir()
+        to_pycolmap(one).write_binary(str(tmp_path / f"{name} by pycolmap"))
+        for file in (tmp_path / f"{name} by pycolmap").iterdir():
+            assert (tmp_path / name / file.name).read_bytes() == file.read_bytes(), file.name
+
+
 def test_binary_models_are_read_as_pycolmap_reads_them(tmp_path):
     """2D points are taken from the file, all else from pycolmap; those without a point in space are keypoints."""
     import pycolmap

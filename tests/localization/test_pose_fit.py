@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Fits of one pose end where a robust cost is least, with and without the focal length; a wrong one is told."""
+"""Fits of one pose end where a robust cost is least, with and without what is free of a lens; a wrong lens is told."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,12 +10,13 @@ from worlds import CAMERA, make_world, project
 from groma.factors.losses import Cauchy, GemanMcClure
 from groma.geometry import se3
 from groma.localization.candidates import closest_of
-from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose
+from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose, pose_from_matches
 from groma.localization.pose.camera import QueryCamera
-from groma.localization.pose.focal_length import focal_step
+from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import max_errors
+from groma.localization.pose.lens import lens_step
 from groma.localization.pose.matches import Matches
-from groma.localization.pose.pose_fit import fit_pose
+from groma.localization.pose.pose_fit import fit_pose, free_lens
 from groma.localization.pose.pose_problem import problem_of
 from groma.localization.pose.refinement import landmark_weights, refine
 from groma.solver.options import SolverOptions
@@ -25,6 +28,13 @@ TO_THE_END = SolverOptions(function_tolerance=1e-15, max_iterations=100)
 def scaled(factor, camera=CAMERA):
     params = camera.params.copy()
     params[:2] *= factor
+    return QueryCamera(camera.model, params, camera.width, camera.height)
+
+
+def shifted(shift, camera=CAMERA):
+    """The same with another principal point, in units of the mean focal length."""
+    params = camera.params.copy()
+    params[2:] += np.asarray(shift) * params[:2].mean()
     return QueryCamera(camera.model, params, camera.width, camera.height)
 
 
@@ -46,20 +56,20 @@ def cost_of(matches, near, loss, pose, camera, sigma=0.7):
 
 
 @pytest.mark.parametrize("loss", [Cauchy(1.5), GemanMcClure(1.9)])
-@pytest.mark.parametrize("focal", [False, True])
-def test_the_cost_is_least_where_a_fit_ends(loss, focal):
-    """Central differences through the motions of pose and focal length: the slope is zero, and every way is upwards."""
+@pytest.mark.parametrize("free", [0, 1, 3])
+def test_the_cost_is_least_where_a_fit_ends(loss, free):
+    """Central differences through the motions of pose and lens: the slope is zero, and every way is upwards."""
     rng = np.random.default_rng(3)
     for _ in range(3):
         world, matches = noisy(rng, 40, 15)
         near = rng.uniform(size=40) < 0.8, rng.uniform(size=15) < 0.8
         problem = problem_of(CAMERA, matches, world.pose)
-        which = np.array([0, 1]) if focal else None
+        which = free_lens(CAMERA.kind, free == 3) if free else None
         states = fit_pose(problem, landmark_weights(problem, matches), near, loss, TO_THE_END, which)
         pose = states["frames"][0]
-        camera = QueryCamera("PINHOLE", states["intrinsics/PINHOLE"][0], 640, 480) if focal else CAMERA
+        camera = QueryCamera("PINHOLE", states["intrinsics/PINHOLE"][0], 640, 480) if free else CAMERA
         least = cost_of(matches, near, loss, pose, camera)
-        for k in range(7 if focal else 6):
+        for k in range(6 + free):
             slopes, steps = [], (1e-4, 1e-3)
             for step in steps:
                 costs = []
@@ -67,6 +77,7 @@ def test_the_cost_is_least_where_a_fit_ends(loss, focal):
                     twist = np.where(np.arange(6) == k, side, 0.0)
                     moved = se3.compose(se3.exp(twist[None]), pose[None])[0]
                     lens = scaled(np.exp(side), camera) if k == 6 else camera
+                    lens = shifted(np.where(np.arange(2) == k - 7, side, 0.0), lens)
                     costs.append(cost_of(matches, near, loss, moved, lens))
                 assert min(costs) > least
                 slopes.append((costs[1] - costs[0]) / (costs[1] + costs[0] - 2.0 * least) * step)
@@ -95,7 +106,8 @@ def test_a_wrong_focal_length_is_found(factor):
         world, matches = noisy(rng, 150, 30)
         wrong = scaled(factor)
         best = refine(wrong, matches, world.pose, (50.0, 50.0))
-        step, sigma = focal_step(best, matches, (50.0, 50.0))
+        told = lens_step(best, matches, (50.0, 50.0))
+        step, sigma = told.focal, told.focal_sigma
         assert sigma < 0.01
         assert step == pytest.approx(-np.log(factor), abs=5.0 * sigma)
         assert refine(wrong, matches, world.pose, (50.0, 50.0), "focal").camera.params[:2] == pytest.approx(
@@ -109,10 +121,33 @@ def test_the_stated_deviation_of_a_focal_length_is_true():
     for _ in range(100):
         world, matches = noisy(rng, 60, 10)
         best = refine(CAMERA, matches, world.pose, max_errors(matches))
-        step, sigma = focal_step(best, matches, max_errors(matches))
-        squares.append((step / sigma) ** 2)
+        always = replace(VERDICT, shift=0.0)  # the principal point is estimated, too
+        told = lens_step(best, matches, max_errors(matches), always)
+        squares.append(((told.focal / told.focal_sigma) ** 2, told.square))
+    of_focal, of_both = np.mean(squares, axis=0)
     # The sum is chi-square with 100 degrees: 0.999 of such are between 60 and 153. The variance is estimated besides.
-    assert 0.6 < np.mean(squares) < 1.53
+    assert 0.6 < of_focal < 1.53
+    # With 300 degrees: between 229 and 384.
+    assert 2.29 < of_both < 3.84
+
+
+def test_a_piece_that_was_moved_is_told_from_its_lens():
+    """What lies in one block of an image, moved as a whole, has its principal point moved by as much."""
+    rng = np.random.default_rng(17)
+    for _ in range(3):
+        world, matches = noisy(rng, 400, 40)
+        kept = (world.points2d[:, 0] > 300) & (world.points2d[:, 1] > 200)
+        block = matches.take(kept, np.zeros(matches.num_lines, bool))
+        for shift in (np.zeros(2), np.array([-0.4, -0.3])):
+            moved = replace(block, points2d=block.points2d + shift * CAMERA.params[:2].mean())
+            found = pose_from_matches(CAMERA, moved)
+            assert found.cam_from_world is not None
+            told = lens_step(refine(CAMERA, moved, found.cam_from_world, (50.0, 50.0)), moved, (50.0, 50.0))
+            if shift.any():
+                assert told.shift == pytest.approx(0.5, abs=0.2)
+                assert (found.status, "principal point" in found.sentence) == ("uncertain", True)
+            else:
+                assert found.status == "localized"
 
 
 def test_a_plane_seen_from_the_front_tells_no_focal_length():
@@ -123,7 +158,8 @@ def test_a_plane_seen_from_the_front_tells_no_focal_length():
     matches = Matches(pixels, X).with_sigma(0.7)
     wrong = scaled(1.1)
     best = refine(wrong, matches, pose + 0.5 * np.eye(7)[6], max_errors(matches))
-    step, sigma = focal_step(best, matches, max_errors(matches))
+    told = lens_step(best, matches, max_errors(matches))
+    step, sigma = told.focal, told.focal_sigma
     assert sigma > 0.05
     found = estimate_absolute_pose(wrong, pixels, X, sigma=(0.7, 1.0), options=PoseOptions(look_for_rival=False))
     assert abs(step) < 5.0 * sigma or found.status == "uncertain"

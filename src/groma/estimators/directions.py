@@ -32,7 +32,7 @@ from groma.estimators._direction_features import Perpendicular, crossings
 from groma.estimators._parallel_lines import PARALLEL, Acceptance, parallel_lines
 from groma.estimators.association import log10_poisson_tail
 from groma.gates import chi_square_gate, gate
-from groma.geometry.algebra import dot, norm, perpendicular, unit, vectors
+from groma.geometry.algebra import dot, unit, vectors
 
 
 @dataclass(frozen=True)
@@ -286,6 +286,7 @@ def _search(
     covariances: list[FloatArray] = []
     alarms: list[float] = []
     least = options.min_coincidences + 2
+    how = DIRECTIONS.wider, DIRECTIONS.max_move, DIRECTIONS.refine_steps
     while len(found) < options.max_directions and len(remaining) >= max(least, 2):
         pool = features.take(remaining)
         guesses = candidates
@@ -299,7 +300,7 @@ def _search(
         accepted = None
         order = np.argsort(-_score(scored, guesses, gate), kind="stable")
         for start in guesses[order[: DIRECTIONS.max_refined]]:
-            direction, covariance = _refine(pool, start, gate)
+            direction, covariance = pool.refined(start, gate, *how)
             inside = pool.squared(direction[None])[0] < gate
             count = int(inside.sum())
             expected = float(np.broadcast_to(pool.chance(direction[None], gate), (1, len(pool))).sum())
@@ -349,32 +350,6 @@ def _score(pool: Perpendicular, candidates: FloatArray, gate: float) -> FloatArr
     """Information (H,) that candidates explain: certain features count more, those near the gate less."""
     agreement = np.maximum(1.0 - pool.squared(candidates) / gate, 0.0)
     return -(agreement * np.log(np.maximum(pool.chance(candidates, gate), 1e-12))).sum(axis=1)
-
-
-def _refine(pool: Perpendicular, start: FloatArray, gate: float) -> tuple[FloatArray, FloatArray]:
-    """Robust least squares: Gauss-Newton with Geman-McClure weights inside twice the gate's radius."""
-    direction = unit(start)
-    information, basis, scale = np.eye(2), np.zeros((2, 3)), 1.0
-    for step in range(DIRECTIONS.refine_steps):
-        squared = pool.squared(direction[None])[0]
-        near = squared < DIRECTIONS.wider * gate
-        last = step == DIRECTIONS.refine_steps - 1
-        if last:
-            near = squared < gate
-        rows = pool.take(near).rows(direction)
-        weight = np.ones(near.sum()) if last else 1.0 / (1.0 + squared[near] / gate) ** 2
-        basis = np.stack(perpendicular(direction))
-        slope = rows @ basis.T
-        residual = rows @ direction
-        information = np.einsum("n,nka,nkb->ab", weight, slope, slope)
-        information += 1e-6 * max(np.trace(information), 1e-300) * np.eye(2)
-        if last:
-            scale = max(1.0, float((residual**2).sum()) / max(residual.size - 2, 1))
-            break
-        move = -np.linalg.solve(information, np.einsum("n,nka,nk->a", weight, slope, residual))
-        move *= min(1.0, DIRECTIONS.max_move / max(float(norm(move)), 1e-300))
-        direction = unit(direction + move @ basis)
-    return direction, scale * basis.T @ np.linalg.inv(information) @ basis
 
 
 __all__ = [

@@ -8,6 +8,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from groma._numba import kernel
 from groma._typing import BoolArray, FloatArray
 from groma.errors import InputError, ShapeError
 
@@ -142,6 +143,19 @@ def perpendicular(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
     np.put_along_axis(axis, np.argmin(np.abs(direction), axis=-1)[..., None], 1.0, axis=-1)
     first = unit(cross(direction, axis))
     return first, cross(unit(direction), first)
+
+
+@kernel
+def perpendicular_to(x, y, z):
+    """The six numbers of :func:`perpendicular` for one unit vector, in compiled loops; zeros for zero."""
+    a, b, c = 0.0, z, -y
+    if abs(y) < abs(x) and abs(y) <= abs(z):
+        a, b, c = -z, 0.0, x
+    elif abs(z) < abs(x) and abs(z) < abs(y):
+        a, b, c = y, -x, 0.0
+    length = max(math.sqrt(a * a + b * b + c * c), 1e-300)
+    a, b, c = a / length, b / length, c / length
+    return a, b, c, y * c - z * b, z * a - x * c, x * b - y * a
 
 
 def cofactor(matrix: FloatArray) -> FloatArray:

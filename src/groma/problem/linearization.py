@@ -23,7 +23,7 @@ from groma.problem._records import chain_rule, cost_scaled, cost_whitened, mask,
 from groma.problem._room import room_for_chunks, room_for_sums
 from groma.problem._sums import add_block, add_cross, add_incidence, add_primary
 from groma.problem.layout import CHUNK_SIZE, Chunk, FactorLayout, Layout, in_runs
-from groma.problem.parallel import Workers, shares_of, sum_of
+from groma.problem.parallel import FACTORS_ALONE, Workers, shares_of, sum_of
 
 States = Mapping[str, FloatArray]
 
@@ -148,10 +148,14 @@ class NormalEquations:
                     landmark_costs[layout.eliminated][first:last] += 0.5 * costs
             return sums, hidden
 
-        parts = self.workers.map(work, len(self.shares))
+        parts = self.workers.map(work, len(self.shares), self._is_little(wanted))
         self.costs = [0.5 * sum(part[0][f] for part in parts) for f in range(len(self.layout.factors))]
         self.hidden = [sum(part[1][f] for part in parts) for f in range(len(self.layout.factors))]
         return float(sum(self.costs))
+
+    def _is_little(self, wanted: Callable[[Chunk], bool] | None) -> bool:
+        """Whether chunks that are wanted hold too few factors to wake another thread for them."""
+        return wanted is not None and sum(c.size for c in self.layout.chunks if wanted(c)) < FACTORS_ALONE
 
     def _runs(self, share: int, wanted: Callable[[Chunk], bool] | None) -> Iterator[tuple[int, int, int]]:
         """Yield factor group, begin and end of factors of many chunks: costs need less room than records."""
@@ -243,7 +247,7 @@ class NormalEquations:
                     self._round(share, chunk)
             return costs, degenerate
 
-        parts = self.workers.map(work, len(self.shares))
+        parts = self.workers.map(work, len(self.shares), self._is_little(wanted))
         self.costs = [0.5 * sum(part[0][f] for part in parts) for f in range(len(self.layout.factors))]
         self.num_degenerate = [sum(part[1][f] for part in parts) for f in range(len(self.layout.factors))]
         self.H = {pair: sum_of([H[pair] for H in self._H], self.workers) for pair in self.layout.num_direct}

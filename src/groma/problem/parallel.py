@@ -33,9 +33,12 @@ class Workers:
         self.count = max(1, count)
         self._pool: ThreadPoolExecutor | None = None
 
-    def map(self, function: Callable[[int], T], tasks: int) -> list[T]:
-        """Return ``[function(0), ..., function(tasks - 1)]``; an exception in a task is raised here."""
-        if self.count == 1 or tasks == 1:
+    def map(self, function: Callable[[int], T], tasks: int, alone: bool = False) -> list[T]:
+        """Return ``[function(0), ..., function(tasks - 1)]``; an exception in a task is raised here.
+
+        ``alone``: they are too little work for other threads.
+        """
+        if alone or self.count == 1 or tasks == 1:
             return [function(task) for task in range(tasks)]
         if self._pool is None:
             self._pool = ThreadPoolExecutor(self.count - 1, thread_name_prefix="groma")
@@ -66,7 +69,8 @@ class Workers:
 
 
 #: Problems with fewer factors are one share: they are not worth a thread; nor is a share of less than half of it. Where
-#: nothing is summed but costs, because nothing stays in a reduced system, fewer are (cost: time only).
+#: nothing is summed but costs, because nothing stays in a reduced system, fewer are, and so is what is left where the
+#: rest has converged (cost: time only).
 FACTORS_FOR_THREADS, FACTORS_ALONE = 50_000, 10_000
 #: Most shares, and most bytes for every factor (about twice what its measurement takes) that copies of the reduced
 #: system would take if every share had one, as with many threads; two shares there are always (cost: memory).

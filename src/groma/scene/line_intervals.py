@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: BSD-3-Clause
-# ruff: noqa: RUF009 - column() is dataclasses.field() with metadata
 """Where along a line images support it: the intervals of its segment that were seen, one landmark for all of them.
 
 The joints left and right of a window may lie on one line, and bind as one in the adjustment, but between them there is
@@ -107,9 +106,10 @@ def shares_on_lines(
     """
     poses = scene.cam_from_world[image_idx]
     bearing = np.full((len(pixels), 3), np.nan)
-    camera, names = scene.images.camera_idx[image_idx], np.array(scene.cameras.models, dtype=object)
+    camera = scene.images.camera_idx[image_idx]
     for name in dict.fromkeys(scene.cameras.models):
-        rows, model = np.flatnonzero(names[camera] == name), camera_model(name)
+        rows = np.flatnonzero(np.array([one == name for one in scene.cameras.models])[camera])
+        model = camera_model(name)
         params = scene.cameras.params[camera[rows], : model.num_parameters]
         bearing[rows] = model.unproject(np.ascontiguousarray(params), np.ascontiguousarray(pixels[rows]))
     ray = quaternion.rotate(quaternion.conjugate(poses[:, :4]), bearing)

@@ -49,8 +49,6 @@ class Term:
     landmarks: tuple[str, ...]
     #: Makes the factors; it may add groups of variables of its own to ``draft.variables``.
     factors: Callable[[Draft], Iterator[Group]]
-    #: Whether these are relations between landmarks, which have a loss of their own.
-    is_relation: bool = False
 
     def applies(self, draft: Draft) -> bool:
         """Tell whether there is anything to do."""
@@ -102,6 +100,11 @@ class Draft:
             rows = np.flatnonzero(position[camera_of] >= 0)
             if len(rows):
                 yield name, rows, Ref(f"intrinsics/{name}", position[camera_of[rows]])
+
+    def by_camera(self, image_idx: IntArray) -> Iterator[tuple[str, IntArray, dict[str, Any]]]:
+        """Yield (name of a camera model, rows of the measurements in its images, what factors take of its cameras)."""
+        for name, rows, intrinsics in self.by_model(image_idx):
+            yield name, rows, {"camera_model": name, "intrinsics": intrinsics, **self.camera_refs(image_idx[rows])}
 
     def params(self, name: str, image_idx: IntArray) -> FloatArray:
         """Return the parameters (N, K) of the cameras of images, all of one model."""

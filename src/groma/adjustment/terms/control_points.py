@@ -22,17 +22,15 @@ from groma.factors.priors.vector_prior import VectorPrior
 
 def _marks(draft: Draft) -> Iterator[Group]:
     table, xyz = draft.scene.marks, draft.scene.control_points.xyz
-    for name, rows, intrinsics in draft.by_model(table.image_idx):
+    for name, rows, camera in draft.by_camera(table.image_idx):
         yield Group(
             PointReprojection(
-                camera_model=name,
                 point=Ref("control_points", table.point_idx[rows]),
-                intrinsics=intrinsics,
                 pixels=table.pixel[rows],
                 require_in_front=draft.options.require_in_front,
                 sqrt_information=1.0 / table.sigma[rows],
                 loss=survey_loss(2),
-                **draft.camera_refs(table.image_idx[rows]),
+                **camera,
                 **point_refs(draft, name, table.image_idx[rows], xyz[table.point_idx[rows]], table.pixel[rows]),
             )
         )

@@ -57,17 +57,15 @@ def line_sigma_px(draft: Draft) -> FloatArray:
 def _factors(draft: Draft) -> Iterator[Group]:
     table, options = draft.scene.line_observations, draft.options
     sigma, lines = line_sigma_px(draft), draft.scene.lines.plucker
-    for name, rows, intrinsics in draft.by_model(table.image_idx):
+    for name, rows, camera in draft.by_camera(table.image_idx):
         if options.line_residual == "endpoints" and camera_model(name).has_pinhole_parameters:
             places = _nearer(table.segment[rows, :2], table.segment[rows, 2:], options.reach)
             factor = LineReprojection(
-                camera_model=name,
                 line=Ref("lines", table.line_idx[rows]),
-                intrinsics=intrinsics,
                 segments=np.hstack(places),
                 sqrt_information=1.0 / sigma[rows],
                 loss=draft.line_loss,
-                **draft.camera_refs(table.image_idx[rows]),
+                **camera,
                 **line_refs(draft, name, table.image_idx[rows], lines[table.line_idx[rows]], places),
             )
             yield Group(factor, observes="lines")

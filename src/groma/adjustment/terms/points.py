@@ -23,17 +23,15 @@ def _factors(draft: Draft) -> Iterator[Group]:
     keep = _in_front(draft) & ~measured_in_pairs(draft)
     table = table.take(np.flatnonzero(keep)) if not keep.all() else table
     xyz = draft.scene.points.xyz
-    for name, rows, intrinsics in draft.by_model(table.image_idx):
+    for name, rows, camera in draft.by_camera(table.image_idx):
         yield Group(
             PointReprojection(
-                camera_model=name,
                 point=Ref("points", table.point_idx[rows]),
-                intrinsics=intrinsics,
                 pixels=table.pixel.take(rows, axis=0),
                 require_in_front=options.require_in_front,
                 sqrt_information=1.0 / (options.point_sigma_px * table.sigma[rows]),
                 loss=options.loss,
-                **draft.camera_refs(table.image_idx[rows]),
+                **camera,
                 **point_refs(draft, name, table.image_idx[rows], xyz[table.point_idx[rows]], table.pixel[rows]),
             ),
             observes="points",

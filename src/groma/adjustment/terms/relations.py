@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import fields
 from typing import Any
 
@@ -38,15 +38,16 @@ ANGLES: dict[str, type[DirectionPair]] = {
     "plane_across_direction": PlanePerpendicularToDirection,
     "plane_along_direction": PlaneParallelToDirection,
 }
-#: Types of the factors of relations, and the relation of the scene each stands for.
-RELATION_FACTORS = {
-    "point_on_plane": "point_on_plane",
-    "segment_on_plane": "line_on_plane",
-    "line_direction": "line_along_direction",
-    "point_on_line": "point_on_line",
-    "lines_meeting": "lines_meeting",
-    **{factor.type_name: kind for kind, factor in ANGLES.items()},
+_TYPES: dict[str, type[Factor]] = {
+    "point_on_plane": PointOnPlane,
+    "point_on_line": PointOnLine,
+    "lines_meeting": LinesMeeting,
+    "line_on_plane": SegmentOnPlane,
+    "line_along_direction": LineDirection,
+    **ANGLES,
 }
+#: Types of the factors of relations, and the relation of the scene each stands for.
+RELATION_FACTORS = {factor.type_name: kind for kind, factor in _TYPES.items()}
 
 
 def lengths_per_pixel(scene: Scene, kind: str) -> FloatArray:
@@ -90,14 +91,21 @@ def lengths_per_pixel(scene: Scene, kind: str) -> FloatArray:
     return np.where(count > 0, mean, fallback)
 
 
-def _weights(draft: Draft, kind: str, of: str, rows: IntArray) -> FloatArray:
-    """Inverse standard deviations of distances: those of the relations, else what the images tell at the landmark."""
-    relations = draft.scene.relations
+def _weights(draft: Draft, kind: str, rows: IntArray) -> FloatArray:
+    """Inverse standard deviations: those of the relations, else what options say of angles and images of lengths."""
+    relations, segments = draft.scene.relations, draft.scene.lines.segments
     sigma, landmark = relations.sigma(kind)[rows], getattr(relations, kind)[rows, 0]
+    if kind in ANGLES:
+        return 1.0 / np.where(sigma > 0.0, sigma, draft.options.plane_angle_sigma)
     if (sigma > 0.0).all():
         return 1.0 / sigma
+    of = "point" if kind.startswith("point") else "line"
     usual = draft.options.structure_sigma_px * lengths_per_pixel(draft.scene, of)[landmark]
-    return 1.0 / np.where(sigma > 0.0, sigma, usual)
+    weights = 1.0 / np.where(sigma > 0.0, sigma, usual)
+    if kind == "line_along_direction":  # the noise of the ends of a line is that of its angle at half its length
+        half = np.maximum(0.5 * np.linalg.norm(segments[landmark, 1] - segments[landmark, 0], axis=1), 1e-12)
+        weights = np.where(sigma > 0.0, weights, weights * half)
+    return weights
 
 
 def metric_rows(draft: Draft, kind: str) -> IntArray:
@@ -114,70 +122,17 @@ def metric_rows(draft: Draft, kind: str) -> IntArray:
 
 def _factors(draft: Draft) -> Iterator[Group]:
     """Yield the factors of the relations whose landmarks take part."""
-    for kind, make in _MAKERS.items():
-        if set(_groups(kind)) <= draft.variables.keys() and len(rows := metric_rows(draft, kind)):
-            yield Group(make(draft, rows))
-
-
-def _points_on_planes(draft: Draft, rows: IntArray) -> Factor:
-    point, plane = draft.scene.relations.point_on_plane[rows].T
-    weights = _weights(draft, "point_on_plane", "point", rows)
-    return PointOnPlane(
-        point=Ref("points", point), plane=Ref("planes", plane), sqrt_information=weights, loss=draft.relation_loss
-    )
-
-
-def _points_on_lines(draft: Draft, rows: IntArray) -> Factor:
-    point, line = draft.scene.relations.point_on_line[rows].T
-    weights = _weights(draft, "point_on_line", "point", rows)
-    return PointOnLine(
-        point=Ref("points", point), line=Ref("lines", line), sqrt_information=weights, loss=draft.relation_loss
-    )
-
-
-def _lines_meeting(draft: Draft, rows: IntArray) -> Factor:
-    first, second = draft.scene.relations.lines_meeting[rows].T
-    weights = _weights(draft, "lines_meeting", "line", rows)
-    return LinesMeeting(
-        first=Ref("lines", first), second=Ref("lines", second), sqrt_information=weights, loss=draft.relation_loss
-    )
-
-
-def _lines_on_planes(draft: Draft, rows: IntArray) -> Factor:
-    line, plane = draft.scene.relations.line_on_plane[rows].T
-    return SegmentOnPlane(
-        line=Ref("lines", line),
-        plane=Ref("planes", plane),
-        ends=draft.scene.lines.segments[line],
-        sqrt_information=_weights(draft, "line_on_plane", "line", rows),
-        loss=draft.relation_loss,
-    )
-
-
-def _lines_along_directions(draft: Draft, rows: IntArray) -> Factor:
-    """Lines along directions; the noise of the ends of a line is that of its angle at half its length."""
-    relations, ends = draft.scene.relations, draft.scene.lines.segments
-    line, direction = relations.line_along_direction[rows].T
-    half = np.maximum(0.5 * np.linalg.norm(ends[line, 1] - ends[line, 0], axis=1), 1e-12)
-    angle = relations.sigma("line_along_direction")[rows]
-    weights = _weights(draft, "line_along_direction", "line", rows)
-    return LineDirection(
-        line=Ref("lines", line),
-        direction=Ref("directions", direction),
-        sqrt_information=np.where(angle > 0.0, weights, weights * half),
-        loss=draft.relation_loss,
-    )
-
-
-def _angles(kind: str) -> Callable[[Draft, IntArray], Factor]:
-    def make(draft: Draft, rows: IntArray) -> Factor:
-        pairs, sigma = getattr(draft.scene.relations, kind)[rows], draft.scene.relations.sigma(kind)[rows]
-        sigma = np.where(sigma > 0.0, sigma, draft.options.plane_angle_sigma)
-        sides = zip(("first", "second"), _groups(kind), pairs.T, strict=True)
-        refs: dict[str, Any] = {side: Ref(group, index) for side, group, index in sides}
-        return ANGLES[kind](**refs, sqrt_information=1.0 / sigma, loss=draft.relation_loss)
-
-    return make
+    for kind, factor in _TYPES.items():
+        groups = _groups(kind)
+        if not (set(groups) <= draft.variables.keys() and len(rows := metric_rows(draft, kind))):
+            continue
+        pairs = getattr(draft.scene.relations, kind)[rows]
+        columns: dict[str, Any] = {
+            slot.name: Ref(group, index) for slot, group, index in zip(factor.slots, groups, pairs.T, strict=True)
+        }
+        if kind == "line_on_plane":
+            columns["ends"] = draft.scene.lines.segments[pairs[:, 0]]
+        yield Group(factor(**columns, sqrt_information=_weights(draft, kind, rows), loss=draft.relation_loss))
 
 
 def _groups(kind: str) -> tuple[str, str]:
@@ -185,12 +140,4 @@ def _groups(kind: str) -> tuple[str, str]:
     return next(item.metadata["refers"] for item in fields(Relations) if item.name == kind)
 
 
-_MAKERS: dict[str, Callable[[Draft, IntArray], Factor]] = {
-    "point_on_plane": _points_on_planes,
-    "point_on_line": _points_on_lines,
-    "lines_meeting": _lines_meeting,
-    "line_on_plane": _lines_on_planes,
-    "line_along_direction": _lines_along_directions,
-    **{kind: _angles(kind) for kind in ANGLES},
-}
-TERM = Term("relations", ("relations",), (), _factors, is_relation=True)
+TERM = Term("relations", ("relations",), (), _factors)

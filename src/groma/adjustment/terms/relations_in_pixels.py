@@ -48,16 +48,14 @@ def _pairs(draft: Draft, kind: str) -> IntArray:
 def _points_on_planes(draft: Draft) -> Iterator[Group]:
     seen = draft.scene.point_observations
     of, plane = _join(seen.point_idx, _pairs(draft, "point_on_plane"), draft.scene.num_points)
-    for name, rows, intrinsics in draft.by_model(seen.image_idx[of]):
+    for _, rows, camera in draft.by_camera(seen.image_idx[of]):
         yield Group(
             PointOnPlanePixels(
                 point=Ref("points", seen.point_idx[of[rows]]),
                 plane=Ref("planes", plane[rows]),
-                camera_model=name,
-                intrinsics=intrinsics,
                 sqrt_information=1.0 / draft.options.point_sigma_px,
                 loss=draft.relation_loss,
-                **draft.camera_refs(seen.image_idx[of[rows]]),
+                **camera,
             )
         )
 
@@ -65,18 +63,16 @@ def _points_on_planes(draft: Draft) -> Iterator[Group]:
 def _lines_on_planes(draft: Draft) -> Iterator[Group]:
     seen = draft.scene.line_observations
     of, plane = _join(seen.line_idx, _pairs(draft, "line_on_plane"), draft.scene.num_lines)
-    for name, rows, intrinsics in draft.by_model(seen.image_idx[of]):
+    for _, rows, camera in draft.by_camera(seen.image_idx[of]):
         line = seen.line_idx[of[rows]]
         yield Group(
             SegmentOnPlanePixels(
                 line=Ref("lines", line),
                 plane=Ref("planes", plane[rows]),
                 ends=draft.scene.lines.segments[line],
-                camera_model=name,
-                intrinsics=intrinsics,
                 sqrt_information=1.0 / draft.options.line_sigma_px,
                 loss=draft.relation_loss,
-                **draft.camera_refs(seen.image_idx[of[rows]]),
+                **camera,
             )
         )
 
@@ -86,32 +82,28 @@ def _points_on_lines(draft: Draft) -> Iterator[Group]:
     points, lines = scene.point_observations, scene.line_observations
     of, point = _join(lines.line_idx, pairs[:, ::-1], scene.num_lines)
     image_lines = segment2.to_line(lines.segment[of])
-    for name, rows, intrinsics in draft.by_model(lines.image_idx[of]):
+    for name, rows, camera in draft.by_camera(lines.image_idx[of]):
         if not camera_model(name).is_planar:  # the chord of a curve is no image of the line, not even nearly
             continue
         yield Group(
             PointToImageLine(
                 point=Ref("points", point[rows]),
                 image_lines=image_lines[rows],
-                camera_model=name,
-                intrinsics=intrinsics,
                 sqrt_information=1.0 / draft.options.line_sigma_px,
                 loss=draft.relation_loss,
-                **draft.camera_refs(lines.image_idx[of[rows]]),
+                **camera,
             )
         )
     of, line = _join(points.point_idx, pairs, scene.num_points)
-    for name, rows, intrinsics in draft.by_model(points.image_idx[of]):
+    for name, rows, camera in draft.by_camera(points.image_idx[of]):
         if camera_model(name).has_pinhole_parameters:
             yield Group(
                 LineToPixel(
                     line=Ref("lines", line[rows]),
                     pixels=points.pixel[of[rows]],
-                    camera_model=name,
-                    intrinsics=intrinsics,
                     sqrt_information=1.0 / draft.options.point_sigma_px,
                     loss=draft.relation_loss,
-                    **draft.camera_refs(points.image_idx[of[rows]]),
+                    **camera,
                 )
             )
 
@@ -145,4 +137,4 @@ def _join(landmark: IntArray, relation: IntArray, count: int) -> tuple[IntArray,
     return observation, (relation[owner, 1] if len(owner) else np.zeros(0, np.int64))
 
 
-TERM = Term("relations in pixels", ("relations",), (), _factors, is_relation=True)
+TERM = Term("relations in pixels", ("relations",), (), _factors)

@@ -63,19 +63,17 @@ def _factors(draft: Draft) -> Iterator[Group]:
         yield from _turned(draft, usable, observation, options.right_turn)
         return
     seen, table = scene.point_observations, scene.right_columns.take(usable)
-    for name, rows, intrinsics in draft.by_model(seen.image_idx[observation]):
+    for _, rows, camera in draft.by_camera(seen.image_idx[observation]):
         left = observation[rows]
         baseline = table.baseline[rows]
         yield Group(
             StereoPoint(
-                camera_model=name,
                 point=Ref("points", seen.point_idx[left]),
-                intrinsics=intrinsics,
                 pixels=np.column_stack([seen.pixel[left], table.u_right[rows]]),
                 baseline=float(baseline[0]) if (baseline == baseline[0]).all() else baseline,
                 sqrt_information=_weights(options.point_sigma_px * seen.sigma[left], table.sigma[rows]),
                 loss=options.loss,
-                **draft.camera_refs(seen.image_idx[left]),
+                **camera,
             ),
             observes="points",
         )

@@ -131,7 +131,12 @@ def points_in_images(path: Path) -> dict[int, np.ndarray]:
 
     pycolmap gives them one by one, which takes most of the time of reading a model.
     """
-    data, at, found = path.read_bytes(), 8, {}
+    return points_within(path.read_bytes())
+
+
+def points_within(data: bytes | bytearray) -> dict[int, np.ndarray]:
+    """Return the same of the content of such a file: views of its bytes."""
+    at, found = 8, {}
     for _ in range(_COUNT.unpack_from(data)[0]):
         number = _INT.unpack_from(data, at)[0]
         at = data.find(b"\0", at + 64) + 1

@@ -23,6 +23,7 @@ from groma import cameras as camera_models
 from groma._typing import FloatArray
 from groma.errors import FileFormatError, InputError, OutputError
 from groma.io.atomic import atomic_output
+from groma.io.colmap.binary_points import write_points
 from groma.io.colmap.files import (
     POINT,
     check_binary_model,
@@ -310,10 +311,14 @@ def write_colmap(
     """
     check_scene_given(scene)
     check_colmap(scene, form)
-    reconstruction = to_pycolmap(scene)
+    reconstruction = to_pycolmap(scene, points=form == "text")
     with atomic_output(path, force) as draft:
         draft.mkdir()
-        (reconstruction.write_binary if form == "binary" else reconstruction.write_text)(str(draft))
+        if form == "binary":
+            reconstruction.write_binary(str(draft))
+            write_points(scene, draft)
+        else:
+            reconstruction.write_text(str(draft))
         _check_written(draft, form, reconstruction, path)
         write_beside(scene, draft, form, like)
 

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-def to_pycolmap(scene: Scene) -> pycolmap.Reconstruction:
-    """Return a :class:`pycolmap.Reconstruction` of cameras, rigs, frames, images and points of a scene."""
+def to_pycolmap(scene: Scene, points: bool = True) -> pycolmap.Reconstruction:
+    """Return a :class:`pycolmap.Reconstruction` of cameras, rigs, frames, images and, if wanted, points of a scene."""
     pycolmap = load_pycolmap()
     reconstruction = pycolmap.Reconstruction()
     for row, number in enumerate(scene.cameras.ids.tolist()):
@@ -38,7 +38,8 @@ def to_pycolmap(scene: Scene) -> pycolmap.Reconstruction:
     _add_rigs(pycolmap, reconstruction, scene)
     pixels, keypoint_idx = _numbered(scene)
     _add_images(pycolmap, reconstruction, scene, pixels)
-    _add_points(pycolmap, reconstruction, scene, keypoint_idx)
+    if points:
+        _add_points(pycolmap, reconstruction, scene, keypoint_idx)
     return reconstruction
 
 

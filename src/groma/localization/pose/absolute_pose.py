@@ -16,9 +16,9 @@ import numpy.typing as npt
 from groma._typing import BoolArray, FloatArray
 from groma.geometry import quaternion
 from groma.localization.pose.camera import QueryCamera
-from groma.localization.pose.focal_length import focal_step
 from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import max_errors, propose, straightened
+from groma.localization.pose.lens import lens_step
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pieces import cells_elsewhere
 from groma.localization.pose.refinement import LensUnknowns, Refined, cells_of, fitted, refine
@@ -238,7 +238,7 @@ def pose_from_matches(
     if mirror is not None and verdict.status == "localized":
         verdict = _unless_mirrored(verdict, best, own, mirror, matches, options)
     if not options.refine_lens and verdict.status == "localized":
-        verdict = doubted_if_other_lens(verdict, *focal_step(best, used, _errors(used, options)))
+        verdict = doubted_if_other_lens(verdict, lens_step(best, used, _errors(used, options)))
     failed = verdict.status == "failed"
     return AbsolutePose(
         verdict.status,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""One pose, with a focal length where that is wanted, as a problem of the solver's loop.
+"""One pose, with focal length and principal point where that is wanted, as a problem of the solver's loop.
 
 A photograph asks for a dozen fits of six unknowns. What a problem of many variables is prepared with, layouts, orders
 and threads, takes longer than the sums themselves; here they are one product of weighted records.
@@ -14,6 +14,7 @@ import numpy as np
 
 from groma._numba import loop
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.cameras import CameraModel
 from groma.factors.losses import Loss, loss_derivatives
 from groma.localization.pose.records import records_at
 from groma.localization.pose.residuals import near_of
@@ -30,7 +31,7 @@ from groma.solver.termination import Termination
 ROUGHLY, FINELY = (SolverOptions(max_iterations=12, function_tolerance=share) for share in (1e-3, 1e-5))
 #: First damping: what agrees is near its minimum (cost: of steps).
 _DAMPING = 1e-6
-#: Largest step of the logarithm of a focal length: what is near changes by more.
+#: Largest step of what is free of a lens: what is near changes by more.
 _FARTHEST = 0.3
 
 
@@ -61,13 +62,43 @@ def _weigh(record, weight, near, loss_tag, parameters):
 
 
 # ----------------------------------------------------------------------------------------------------------- Public
+@dataclass(frozen=True)
+class FreeLens:
+    """What is estimated of a lens: the logarithm of its focal lengths, which change by one factor, and the place of its
+    principal point in units of them.
+    """
+
+    focal: IntArray
+    #: The coordinates of the principal point that are estimated; none where it is held.
+    center: IntArray
+
+    def directions(self, params: FloatArray) -> FloatArray:
+        """Derivatives (p, 1 + c) of the parameters (p,) of a camera by these unknowns."""
+        found = np.zeros((len(params), 1 + len(self.center)))
+        found[self.focal, 0] = params[self.focal]
+        found[self.center, 1 + np.arange(len(self.center))] = params[self.focal].mean()
+        return found
+
+    def moved(self, params: FloatArray, step: FloatArray) -> FloatArray:
+        """Parameters after a step (1 + c,), which is cut off where it is large."""
+        step, found = np.clip(step, -_FARTHEST, _FARTHEST), params.copy()
+        found[self.center] += step[1:] * params[self.focal].mean()
+        found[self.focal] *= np.exp(step[0])
+        return found
+
+
+def free_lens(kind: CameraModel, center: bool) -> FreeLens:
+    """What is estimated of a lens with its focal length, or with that and its principal point (center)."""
+    return FreeLens(np.array(kind.focal_indices), np.array(kind.principal_point_indices * center, np.int64))
+
+
 def fit_pose(
     problem: Problem,
     weights: Sequence[FloatArray],
     near: tuple[BoolArray, BoolArray],
     loss: Loss,
     options: SolverOptions,
-    focal: IntArray | None = None,
+    lens: FreeLens | None = None,
 ) -> dict[str, FloatArray]:
     """Return the states of a problem of one pose that a robust cost is least at; landmarks are held.
 
@@ -81,13 +112,12 @@ def fit_pose(
         On squared whitened residuals.
     options
         When it ends.
-    focal
-        The focal lengths among the parameters of its camera, if all of them may change by one factor; else they are
-        held.
+    lens
+        What is estimated of the camera, too; else it is held.
     """
     kept: dict[str, BoolArray] = dict(zip(("points", "lines"), near, strict=True))
     rows = [near_of(factor, kept) for factor in problem.factors]
-    fit = _PoseProblem(problem, weights, rows, loss, focal, options.function_tolerance)
+    fit = _PoseProblem(problem, weights, rows, loss, lens, options.function_tolerance)
     report = SolveReport()
     minimise(fit, options, report, Stopwatch(report))
     return fit.here.states
@@ -116,15 +146,15 @@ class _PoseProblem:
         weights: Sequence[FloatArray],
         near: Sequence[BoolArray],
         loss: Loss,
-        focal: IntArray | None,
+        lens: FreeLens | None,
         tolerance: float,
     ) -> None:
-        self._problem, self._weights, self._near, self._focal = problem, weights, near, focal
+        self._problem, self._weights, self._near, self._lens = problem, weights, near, lens
         self._loss = loss.tag, loss.parameters
         self._held = {name: group.ambient() for name, group in problem.variables.items()}
         self._tolerance = tolerance
         self._damping = NielsenDamping(_DAMPING)
-        moves = {n for n in problem.variables if n == "frames" or (focal is not None and n.startswith("intrinsics"))}
+        moves = {n for n in problem.variables if n == "frames" or (lens is not None and n.startswith("intrinsics"))}
         self.here = self._evaluated({name: problem.variables[name].state for name in moves})
 
     @property
@@ -185,14 +215,13 @@ class _PoseProblem:
         return self._damping.refuse(trial) if trial.has_step else Termination.SINGULAR
 
     def _moved(self, step: FloatArray) -> dict[str, FloatArray]:
-        """States after a step of the pose, and of the logarithm of the focal length."""
+        """States after a step of the pose, and of what is free of the lens."""
         states = self.here.states
         pose = self._problem.variables["frames"].manifold
         found = {"frames": pose.retract(states["frames"], step[None, :6])}
         for name, state in states.items():
-            if name != "frames":
-                found[name] = state.copy()
-                found[name][:, self._focal] *= np.exp(np.clip(step[6], -_FARTHEST, _FARTHEST))
+            if name != "frames" and self._lens is not None:
+                found[name] = self._lens.moved(state[0], step[6:])[None]
         return found
 
     def _evaluated(self, states: dict[str, FloatArray]) -> _PoseTrial:
@@ -206,8 +235,8 @@ class _PoseProblem:
             record = records_at(read, factor, wanted)
             own, blind = _weigh(record, weight, near, *self._loss)
             rows = record.reshape(-1, record.shape[2])
-            if lens is not None:
-                by_focal = rows[:, 6:-1][:, self._focal] @ lens[self._focal]
-                rows = np.column_stack([rows[:, :6], by_focal, rows[:, -1]])
+            if lens is not None and self._lens is not None:
+                by_lens = rows[:, 6:-1] @ self._lens.directions(lens)
+                rows = np.column_stack([rows[:, :6], by_lens, rows[:, -1]])
             cost, hidden, total = cost + own, hidden + blind, total + rows.T @ rows
         return _PoseTrial(cost=cost, num_hidden=hidden, states=states, total=np.asarray(total))

@@ -44,7 +44,7 @@ from groma.geometry import se3
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.gates import REFINEMENT, RefinementGates
 from groma.localization.pose.matches import Matches, nearest_claims
-from groma.localization.pose.pose_fit import FINELY, ROUGHLY, fit_pose
+from groma.localization.pose.pose_fit import FINELY, ROUGHLY, fit_pose, free_lens
 from groma.localization.pose.pose_problem import problem_of
 from groma.localization.pose.records import landmark_rows, records, times
 from groma.localization.pose.residuals import Residuals, residual_squares_of, residuals, weighted_near
@@ -56,7 +56,7 @@ from groma.solver.solve import solve
 _SINGULAR = 1e-10
 _LENS = SolverOptions(max_iterations=30, function_tolerance=1e-6, threads=1)
 #: What is estimated of the lens.
-LensUnknowns = Literal["none", "focal", "all"]
+LensUnknowns = Literal["none", "focal", "pinhole", "all"]
 
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
@@ -216,7 +216,8 @@ def refine(
     max_error
         Matches of points and lines further from where a pose puts them, pixels, say nothing about pose and noise.
     lens
-        Estimate the focal length (several by one factor), or all of the lens, too.
+        Estimate the focal length (several by one factor), that and the principal point, or focal length and
+        distortion, too.
     gathered
         The matches were looked for near the start, as far as it may be off: all of them are near at first.
     gates
@@ -239,8 +240,8 @@ def refine(
             solved = solve(with_loss(weighted_near(problem, weights, near), loss), _LENS).problem
             states = {name: group.state for name, group in solved.variables.items()}
         else:
-            focal = np.array(camera.kind.focal_indices) if lens == "focal" else None
-            states = fit_pose(problem, weights, near, loss, FINELY if last else ROUGHLY, focal)
+            free = free_lens(camera.kind, lens == "pinhole") if lens != "none" else None
+            states = fit_pose(problem, weights, near, loss, FINELY if last else ROUGHLY, free)
         moved = problem.with_states(states)
         estimated = camera if lens == "none" else _camera_of(moved, camera)
         if estimated is None:
@@ -315,13 +316,12 @@ def _in_front(camera: QueryCamera, matches: Matches, pose: FloatArray) -> BoolAr
 
 
 def _lens_directions(camera: QueryCamera, lens: LensUnknowns) -> FloatArray | None:
-    """Directions (p, k) in which parameters of a camera are estimated: the logarithm of its focal length, or all."""
-    focal = list(camera.kind.focal_indices)
+    """Directions (p, k) in which parameters of a camera are estimated."""
     if lens == "none":
         return None
-    if lens == "focal":
-        return np.where(np.isin(np.arange(len(camera.params)), focal), camera.params, 0.0)[:, None]
-    return np.eye(len(camera.params))[:, sorted((*focal, *camera.kind.extra_indices))]
+    if lens != "all":
+        return free_lens(camera.kind, lens == "pinhole").directions(camera.params)
+    return np.eye(len(camera.params))[:, sorted((*camera.kind.focal_indices, *camera.kind.extra_indices))]
 
 
 def landmark_weights(problem: Problem, matches: Matches) -> list[FloatArray]:

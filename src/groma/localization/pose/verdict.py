@@ -37,6 +37,7 @@ from groma._typing import BoolArray, FloatArray
 from groma.geometry import se3
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.gates import VERDICT, VerdictGates
+from groma.localization.pose.lens import LensStep
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.refinement import Refined, cells_of
 
@@ -195,17 +196,27 @@ def doubted_if_repeated(verdict: Verdict, often: float, gates: VerdictGates = VE
     return Verdict("uncertain", 1.0 - gates.right, words)
 
 
-def doubted_if_other_lens(verdict: Verdict, step: float, sigma: float, gates: VerdictGates = VERDICT) -> Verdict:
-    """Return a verdict, or ``uncertain`` where what agrees asks for another focal length: a step of its estimate, as a
-    share of it, is large beside its standard deviation.
+def doubted_if_other_lens(verdict: Verdict, step: LensStep, gates: VerdictGates = VERDICT) -> Verdict:
+    """Return a verdict, or ``uncertain`` where what agrees asks for a principal point far from the one that was given,
+    or for another focal length: a step that is large, also beside its standard deviation.
     """
-    if verdict.status != "localized" or abs(step) <= max(gates.focal, gates.focal_noise * sigma):
+    from scipy.special import chdtrc
+
+    if verdict.status != "localized":
         return verdict
-    words = (
-        f"{verdict.sentence} But they fit a {'longer' if step > 0.0 else 'shorter'} focal length better: the "
-        "calibration is not that of this photograph. Pass its own, or let it be estimated (--calibration unknown)."
-    )
-    return Verdict("uncertain", 1.0 - gates.right, words)
+    if step.shift > gates.shift and chdtrc(3.0, step.square) < 1.0 - gates.whole:
+        why = (
+            "a principal point far from where it should be better: the photograph may be cropped, or put together of "
+            "pieces."
+        )
+    elif abs(step.focal) > max(gates.focal, gates.focal_noise * step.focal_sigma):
+        why = (
+            f"a {'longer' if step.focal > 0.0 else 'shorter'} focal length better: the calibration is not that of this "
+            "photograph. Pass its own, or let it be estimated (--calibration unknown)."
+        )
+    else:
+        return verdict
+    return Verdict("uncertain", 1.0 - gates.right, f"{verdict.sentence} But they fit {why}")
 
 
 def votes_of_a_rival(agree: int, gates: VerdictGates = VERDICT) -> int:

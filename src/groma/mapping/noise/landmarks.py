@@ -283,9 +283,8 @@ def _share_on_line(scene: Scene, image_idx: IntArray, measured: FloatArray, ends
 def _by_model(scene: Scene, image_idx: IntArray):
     """Yield (model name, rows, parameters (n, k) of the rows)."""
     camera = scene.images.camera_idx[image_idx]
-    names = np.array(scene.cameras.models, dtype=object)
     for name in dict.fromkeys(scene.cameras.models):
-        rows = np.flatnonzero(names[camera] == name)
+        rows = np.flatnonzero(np.array([one == name for one in scene.cameras.models])[camera])
         if len(rows):
             yield name, rows, scene.cameras.params[camera[rows], : camera_model(name).num_parameters]
 

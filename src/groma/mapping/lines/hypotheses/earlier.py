@@ -89,28 +89,31 @@ def _moved_px(
 ) -> FloatArray:  # fmt: skip
     """(k,) how far the epipolar lines of image i in others moved at places it sees, pixels; infinite without places."""
     places = places[:: max(1, len(places) // gates.num_points)]
+    if not len(places) or not len(others):
+        return np.full(len(others), np.inf)
+    first = _pixels(before, after, np.full(len(places), i), places)
+    # Where points were seen before, by the present lens; and the present epipolar lines of the first.
+    second = _pixels(before, after, np.repeat(others, len(places)), np.tile(places, (len(others), 1)))
+    camera = views.camera[others]
+    across = camera[:, :, :3] @ np.linalg.inv(views.camera[i, :, :3])
+    epipole = camera @ np.append(views.center[i], 1.0)
+    line = np.cross(epipole[:, None], first @ np.swapaxes(across, 1, 2))
+    away = np.abs((line * second.reshape(len(others), -1, 3)).sum(2)) / np.linalg.norm(line[:, :, :2], axis=2)
     moved = np.full(len(others), np.inf)
-    first = _pixels(before, after, i, places)
-    for n, j in enumerate(others):
-        # Where points were seen before, by the present lens; and the present epipolar lines of the first.
-        second = _pixels(before, after, int(j), places)
-        camera = views.camera[j]
-        across = camera[:, :3] @ np.linalg.inv(views.camera[i, :, :3])
-        line = np.cross(camera @ np.append(views.center[i], 1.0), first @ across.T)
-        away = np.abs((line * second).sum(1)) / np.linalg.norm(line[:, :2], axis=1)
-        away = away[np.isfinite(away)]
-        if len(away):
-            moved[n] = np.quantile(away, 1.0 - gates.moved_share)
+    for n, one in enumerate(away):
+        one = one[np.isfinite(one)]
+        if len(one):
+            moved[n] = np.quantile(one, 1.0 - gates.moved_share)
     return moved
 
 
-def _pixels(before: Scene, after: Scene, image: int, places: FloatArray) -> FloatArray:
-    """Homogeneous pixels (n, 3) where a scene saw points, undistorted by the lens of another; NaN behind a camera."""
-    pixels = pixels_of(before, np.full(len(places), image), places)
-    camera = after.images.camera_idx[image]
-    model = camera_models.model(after.cameras.models[camera])
+def _pixels(before: Scene, after: Scene, image_idx: IntArray, places: FloatArray) -> FloatArray:
+    """Homogeneous pixels (n, 3) where images saw points, undistorted by the lenses of another scene; NaN behind."""
+    pixels = pixels_of(before, image_idx, places)
     straight = np.full((len(places), 3), np.nan)
-    front = np.isfinite(pixels).all(axis=1)
-    straight[front, :2] = model.undistort_pixels(after.cameras.params_of(camera), pixels[front])
+    front, camera = np.isfinite(pixels).all(axis=1), after.images.camera_idx[image_idx]
+    for one in np.unique(camera):
+        rows, model = np.flatnonzero(front & (camera == one)), camera_models.model(after.cameras.models[one])
+        straight[rows, :2] = model.undistort_pixels(after.cameras.params_of(one), pixels[rows])
     straight[:, 2] = 1.0
     return straight

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Does the lens that was given agree with what is seen? An estimate of focal length and principal point tells.
+
+With a wrong focal length a pose nearer or farther fits about as well, by the distances of its landmarks; its stated
+deviation then is that of another camera. Where a piece of a photograph is moved in the image, as if it were cropped or
+put together of pieces, a pose turned by as much fits about as well, and its principal point is where the piece came
+from. What agrees with that pose was chosen by it, so that one step from there says little: the lens is fitted to all
+that is near, as a pose is, until that stays the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from groma._typing import FloatArray
+from groma.gates import gate
+from groma.localization.pose.gates import VERDICT, VerdictGates
+from groma.localization.pose.matches import Matches
+from groma.localization.pose.refinement import Refined, fitted, refine
+
+
+@dataclass(frozen=True)
+class LensGates:
+    """What a lens is estimated from."""
+
+    matches: int = gate(400, "matches", "at most, every so many-th", "cost: of a fit")
+
+
+GATES = LensGates()
+
+
+@dataclass(frozen=True)
+class LensStep:
+    """How far an estimate of a lens is from the one that was given."""
+
+    #: The share by which the focal length should grow, and its standard deviation; the latter is infinite where that is
+    #: not determined.
+    focal: float
+    focal_sigma: float
+    #: How far the principal point moves if it is estimated, too, focal lengths; and the squared step of both in units
+    #: of their covariance. Zero where one step says that it is near, or nothing determines it.
+    shift: float = 0.0
+    square: float = 0.0
+
+
+def lens_step(
+    refined: Refined, matches: Matches, max_error: tuple[float, float], gates: VerdictGates = VERDICT
+) -> LensStep:
+    """Estimate the focal length near a pose, and the principal point if it may be far.
+
+    Parameters
+    ----------
+    refined, matches
+        A pose with the lens that was given, and what was looked for near it.
+    max_error
+        Of :func:`groma.localization.pose.refinement.refine`.
+    gates
+        What far means.
+    """
+    some = _evenly(matches, GATES.matches)
+    found = refine(refined.camera, some, refined.pose, max_error, "focal", gathered=True)
+    focal, covariance = _step(refined, found, some)
+    told = LensStep(float(focal[0]), float(np.sqrt(covariance[0, 0])))
+    points = refined.camera.kind.principal_point_indices
+    if not points or not _may_be_far(fitted(found.camera, some, found.pose, max_error, "pinhole"), 0.5 * gates.shift):
+        return told
+    found = refine(refined.camera, some, refined.pose, max_error, "pinhole", gathered=True)
+    step, covariance = _step(refined, found, some)
+    if not np.isfinite(covariance).all():
+        return told
+    square = float(step @ np.linalg.solve(covariance, step))
+    return LensStep(told.focal, told.focal_sigma, float(np.linalg.norm(step[1:])), square)
+
+
+def _step(given: Refined, found: Refined, matches: Matches) -> tuple[FloatArray, FloatArray]:
+    """Steps (k,) of what was estimated of a lens, from the one that was given, and their covariance."""
+    covariance = found.joint_covariance(matches)[6:, 6:]
+    kind, params = found.camera.kind, given.camera.params
+    focal = kind.focal_length(params)
+    center = (found.camera.params - params)[list(kind.principal_point_indices)] / focal
+    step = np.append(np.log(kind.focal_length(found.camera.params) / focal), center)
+    return step[: len(covariance)], covariance
+
+
+def _may_be_far(here: Refined, limit: float) -> bool:
+    """Whether one step of all unknowns, by what agrees, moves the principal point farther; or it is not determined."""
+    chosen = ((here.points, here.point_inliers), (here.lines, here.line_inliers))
+    J = np.concatenate([found.by_pose[kept] for found, kept in chosen]).reshape(-1, 9)
+    r = np.concatenate([found.value[kept] for found, kept in chosen]).ravel()
+    return not np.linalg.norm(np.linalg.lstsq(J, r)[0][7:]) <= limit
+
+
+def _evenly(matches: Matches, count: int) -> Matches:
+    """Every so many-th match, so that so many are left."""
+    step = -(-(matches.num_points + matches.num_lines) // count)
+    return matches.take(np.arange(0, matches.num_points, step), np.arange(0, matches.num_lines, step))
