@@ -95,3 +95,14 @@ def test_operators_mean_what_they_mean_to_numba():
             meant = context.resolve_function_type(add, (one, other), {})
             for _ in range(2):
                 assert shortcuts._Typing(context).resolve_function_type(add, (one, other), {}) == meant
+
+
+def test_setting_and_attributes_mean_what_they_mean_to_numba():
+    context, array = cpu_target.typing_context, types.float64[:, ::1]
+    ours = shortcuts._Typing(context)
+    for index, value in ((types.literal(1), types.float64[::1]), (types.UniTuple(types.int32, 2), types.int64)):
+        for _ in range(2):
+            assert ours.resolve_setitem(array, index, value) == context.resolve_setitem(array, index, value)
+    for attribute in ("shape", "size", "T", "nothing_of_this_name"):
+        for _ in range(2):
+            assert ours.resolve_getattr(array, attribute) == context.resolve_getattr(array, attribute)

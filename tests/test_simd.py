@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from groma._numba import loop
-from groma._simd import add_matvec, add_product, set_product, width
+from groma._simd import add_matvec, add_product, any_width, set_product, width, width_for
 
 pytestmark = pytest.mark.kernels
 
@@ -41,6 +41,28 @@ def test_products(depth, rows, lanes):
         outside = np.ones(len(C), bool)
         outside[inside] = False
         np.testing.assert_array_equal(target[outside], C[outside])
+
+
+@pytest.mark.parametrize(("depth", "rows", "lanes"), [(1, 1, 1), (2, 3, 9), (3, 6, 6), (4, 4, 10), (2, 1, 5)])
+@pytest.mark.parametrize("call", [_call_add, _call_set])
+def test_sizes_known_late_give_the_same_bits(call, depth, rows, lanes):
+    rng = np.random.default_rng(depth * 100 + rows * 10 + lanes)
+    A, B = rng.normal(size=1 + depth * (rows + 1)), rng.normal(size=2 + depth * (lanes + 3))
+    C = rng.normal(size=3 + rows * lanes + 4)
+    targets = []
+    for sized in (width, any_width):
+        target = C.copy()
+        call(target, 3, A, 1, rows + 1, B, 2, lanes + 3, sized(depth), sized(rows), sized(lanes))
+        targets.append(target)
+    assert not np.array_equal(targets[0], C)
+    assert targets[0].tobytes() == targets[1].tobytes()
+
+
+def test_few_blocks_beside_many_have_no_loop_of_their_own():
+    assert width_for(1000, 4004)(3) is any_width(3)
+    assert width_for(1001, 4004)(3) == width(3)
+    assert width_for(1024, 10**9)(3) == width(3)
+    assert width_for(3, 3)(2) == width(2)
 
 
 @pytest.mark.parametrize(("rows", "lanes"), [(1, 1), (3, 9), (4, 6), (6, 10)])

@@ -26,6 +26,7 @@ from numba.core.typed_passes import NativeLowering as NumbaLowering
 from numba.core.typed_passes import NopythonTypeInference
 
 from groma._kernels.elements import NativeLowering
+from groma._kernels.lifetimes import on_demand
 from groma._kernels.loading import rebuilt
 from groma._kernels.shortcuts import TypeInference
 
@@ -112,6 +113,10 @@ class _InnerLibrary(_Library):
 
 class _Steps(PassManager):
     """Numba's steps of compiling, without the events, descriptions and clocks around each, a twentieth of the time."""
+
+    def run(self, state: Any) -> None:
+        with on_demand():
+            super().run(state)
 
     def _runPass(self, index: int, pss: Any, internal_state: Any) -> None:  # type: ignore[override]  # noqa: N802
         pss.analysis = self._analysis

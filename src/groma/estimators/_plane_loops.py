@@ -237,7 +237,7 @@ def connected_loop(places, rows, tested, which, spacing, link, plane, out):
 
     Only those ``which`` (K,) are tested; ``out`` (K,) is filled.
     """
-    flat, at, home = np.empty((len(rows), 3)), np.empty(3), 0
+    flat, at, home = np.empty((len(rows), 3)), np.empty(3), np.int64(0)
     nearest, squared = np.empty(1, np.int64), np.empty(1)
     for k in range(len(rows)):
         height = height_kernel(places[rows[k]], plane)

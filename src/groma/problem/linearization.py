@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from groma._simd import width
+from groma._simd import width, width_for
 from groma._typing import FloatArray
 from groma.problem._records import chain_rule, cost_scaled, cost_whitened, mask, weigh, whiten
 from groma.problem._room import room_for_chunks, room_for_sums
@@ -318,37 +318,38 @@ class NormalEquations:
 
     def _sums_of(self, share: int, layout: FactorLayout) -> list[tuple[Callable, int | None, tuple]]:
         """Return the loops that sum the records of a factor group, the class of W they add to, and arguments."""
-        rows = width(layout.factor.residual_size)
+        sized = width_for(len(layout.factor), max(len(other.factor) for other in self.layout.factors))
+        rows, one = sized(layout.factor.residual_size), sized(1)
         H, g = self._H[share], self._g[share]
         sums: list[tuple[Callable, int | None, tuple]] = []
         rest = layout.kept
         if layout.eliminated is not None:
             e = layout.eliminated
-            l_width = width(self.layout.eliminated[e].dof)
+            l_width = sized(self.layout.eliminated[e].dof)
             landmarks = (self.V[e], self.g_landmarks[e])
             if not layout.kept:
-                return [(add_block, None, (layout.landmark, layout.landmark_column, *landmarks, rows, l_width, _ONE))]
+                return [(add_block, None, (layout.landmark, layout.landmark_column, *landmarks, rows, l_width, one))]
             first, rest = layout.kept[0], layout.kept[1:]
             c = first.kept_class
             indices = (layout.landmark, layout.landmark_column, first.incidence, first.block, first.column)
             targets = (*landmarks, self._chunk_W[share][e][c], H[c, c], g[c], self._alone[e][c])
-            widths = (rows, l_width, width(self.layout.kept[c].width), _ONE)
+            widths = (rows, l_width, sized(self.layout.kept[c].width), one)
             sums.append((add_primary, c, (*indices, *targets, *widths)))
             for entry in rest:
                 c = entry.kept_class
                 indices = (layout.landmark_column, entry.incidence, entry.column)
-                widths = (rows, l_width, width(self.layout.kept[c].width))
+                widths = (rows, l_width, sized(self.layout.kept[c].width))
                 sums.append((add_incidence, c, (*indices, self._chunk_W[share][e][c], *widths)))
         for entry in rest:
             c = entry.kept_class
             targets = (H[c, c], g[c])
             sums.append(
-                (add_block, None, (entry.block, entry.column, *targets, rows, width(self.layout.kept[c].width), _ONE))
+                (add_block, None, (entry.block, entry.column, *targets, rows, sized(self.layout.kept[c].width), one))
             )
         for i, j, slot in layout.crosses:
             a, b = layout.kept[i], layout.kept[j]
             pair = (a.kept_class, b.kept_class)
-            widths = [width(self.layout.kept[c].width) for c in pair]
+            widths = [sized(self.layout.kept[c].width) for c in pair]
             blocks = (a.block, a.column, b.block, b.column, slot)
             sums.append((add_cross, None, (*blocks, pair[0] == pair[1], H[pair], rows, *widths)))
         return sums

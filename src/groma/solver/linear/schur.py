@@ -23,7 +23,7 @@ from __future__ import annotations
 import numpy as np
 
 from groma._numba import loop
-from groma._simd import add_matvec, add_product, set_product, width
+from groma._simd import add_matvec, add_product, set_product, width, width_for
 from groma._typing import FloatArray, IntArray
 from groma.problem.layout import Chunk, Eliminated, Layout
 from groma.problem.linearization import NormalEquations
@@ -173,8 +173,6 @@ def _landmark_steps(N, t, V, g, begin, end, delta, dof):
 
 # ----------------------------------------------------------------------------------------------------------- Public
 
-_ONE = width(1)
-
 
 class ReducedSystem:
     """The blocks of S and the right-hand side, and the way back to the landmarks."""
@@ -196,6 +194,9 @@ class ReducedSystem:
         widest = max([c.width for c in layout.kept], default=0)
         tallest = max([e.dof for e in layout.eliminated], default=0)
         self._Y = [np.zeros(widest * tallest) for _ in range(shares)]
+        self._most_pairs = max(
+            (int(i.pair_pointer[-1]) for e in layout.eliminated for i in e.incidences.values()), default=0
+        )
         kinds = [layout.problem.variables[e.group].manifold.kind for e in layout.eliminated]
         self._landmark_damping = [LANDMARK_DAMPING.get(kind, 1.0) for kind in kinds]
         self._singular = [0] * shares
@@ -229,17 +230,19 @@ class ReducedSystem:
         self._singular[share] += singular
         self._steepest[share] = float(np.maximum(self._steepest[share], steepest))
         for c, incidences in eliminated.incidences.items():
+            sized = width_for(int(incidences.pair_pointer[-1]), self._most_pairs)
             _eliminate(
                 incidences.pointer, incidences.block, *equations.blocks_of_chunk(share, chunk, c), N, h,
                 chunk.begin, chunk.end, incidences.pair_slots, incidences.pair_pointer, self._Y[share],
-                S[c, c], self._g[share][c], dof, width(self.layout.kept[c].width), _ONE,
+                S[c, c], self._g[share][c], sized(eliminated.dof), sized(self.layout.kept[c].width), sized(1),
             )  # fmt: skip
         for (a, b), (slots, pointer) in eliminated.cross.items():
+            sized = width_for(int(pointer[-1]), self._most_pairs)
             _eliminate_cross(
                 eliminated.incidences[a].pointer, *equations.blocks_of_chunk(share, chunk, a),
                 eliminated.incidences[b].pointer, *equations.blocks_of_chunk(share, chunk, b),
                 N, chunk.begin, chunk.end, slots, pointer, self._Y[share], S[a, b],
-                dof, width(self.layout.kept[a].width), width(self.layout.kept[b].width),
+                sized(eliminated.dof), sized(self.layout.kept[a].width), sized(self.layout.kept[b].width),
             )  # fmt: skip
         if chunk is self._last[share]:
             self._sums.end(share)
