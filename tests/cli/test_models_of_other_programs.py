@@ -50,7 +50,8 @@ def test_poses_alone_are_no_model_for_a_map(here, capsys):
     assert run(["map", "images", "--model", "nerf", "-o", "out"]) == 1
     assert capsys.readouterr().err.count("\n") == 1
     assert run(["adjust", "nerf", "-o", "out"]) == 1
-    assert "nothing to adjust" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "nothing to adjust" in said and "no observations of points or lines. groma map PHOTOGRAPHS --poses" in said
 
 
 def test_damage_is_one_line(here, capsys):

@@ -201,6 +201,11 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
     relation_loss = relation_loss_of(scene, options)
     assembly = assemble(scene, assembly_options_of(scene, options, stages[-1], relation_loss), options.terms)
     if not assembly.problem.factors:
+        if not scene.num_point_observations and not scene.num_line_observations:
+            raise InputError(
+                f"There is nothing to adjust: the scene has {counted(scene.num_images, 'images')} and no observations "
+                "of points or lines. groma map PHOTOGRAPHS --poses FILE finds them at the poses of a file."
+            )
         raise InputError(
             f"There is nothing to adjust: the scene has {counted(scene.num_images, 'images')}, "
             f"{scene.num_point_observations:,} point and {scene.num_line_observations:,} line observations, and the "

@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: BSD-3-Clause
-# ruff: noqa: RUF009 - column() is dataclasses.field() with metadata
 """Trajectories in the formats of TUM, KITTI, EuRoC and Redwood, plain or compressed by gzip.
 
 =========  =====================================================================  =================================

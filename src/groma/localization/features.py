@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from groma._rows import Rows, column
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import together
 from groma.features.contract import SegmentDetector
@@ -50,36 +51,15 @@ FEATURES = FeatureGates()
 
 
 @dataclass(frozen=True, eq=False)
-class DescribedPoints:
+class DescribedPoints(Rows):
     """Points of an image."""
 
     #: (n, 2) pixels, (n,) their standard deviations.
-    pixels: FloatArray
-    sigma: FloatArray
+    pixels: FloatArray = column(2)
+    sigma: FloatArray = column()
     #: (n, 128) descriptors, and which of them are upright instead of along the direction of the gradients.
-    descriptors: Bytes
-    upright: BoolArray
-
-    def __len__(self) -> int:
-        return len(self.pixels)
-
-    def take(self, rows: IntArray) -> DescribedPoints:
-        """The chosen points."""
-        return DescribedPoints(self.pixels[rows], self.sigma[rows], self.descriptors[rows], self.upright[rows])
-
-    def joined(self, other: DescribedPoints) -> DescribedPoints:
-        """These points and others."""
-        return DescribedPoints(
-            np.concatenate([self.pixels, other.pixels]),
-            np.concatenate([self.sigma, other.sigma]),
-            np.concatenate([self.descriptors, other.descriptors]),
-            np.concatenate([self.upright, other.upright]),
-        )
-
-    @staticmethod
-    def empty() -> DescribedPoints:
-        """No points."""
-        return DescribedPoints(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128), np.uint8), np.zeros(0, bool))
+    descriptors: Bytes = column(128, dtype=np.uint8)
+    upright: BoolArray = column(dtype=bool)
 
 
 @dataclass(frozen=True, eq=False)

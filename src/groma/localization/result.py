@@ -98,7 +98,8 @@ class LocalizeResult:
 def _table(queries: Sequence[PlacedImage]) -> str:
     """The queries as a card of the page."""
     rows = "".join(
-        f"<tr><td>{html.escape(one.name)}</td><td>{one.status}</td><td>{len(one.point):,}</td><td>{len(one.line):,}</td>"
+        f'<tr><td class="name">{html.escape(one.name)}</td><td>{one.status}</td>'
+        f"<td>{len(one.point):,}</td><td>{len(one.line):,}</td>"
         f'<td class="words">{html.escape(one.sentence)}</td></tr>'
         for one in queries
     )

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
+from groma._rows import Rows, column
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
@@ -131,19 +132,15 @@ def _tracks(edges: IntArray, image: IntArray) -> IntArray:
 
 
 @dataclass(frozen=True, eq=False)
-class _Observed:
+class _Observed(Rows):
     """Features that belong to tracks."""
 
     #: (n,) their numbers among all features, images, and tracks; pixels (n, 2), standard deviations.
-    row: IntArray
-    image: IntArray
-    track: IntArray
-    pixel: FloatArray
-    sigma: FloatArray
-
-    def take(self, kept: BoolArray) -> _Observed:
-        """Some of them."""
-        return _Observed(self.row[kept], self.image[kept], self.track[kept], self.pixel[kept], self.sigma[kept])
+    row: IntArray = column(dtype=np.int64)
+    image: IntArray = column(dtype=np.int64)
+    track: IntArray = column(dtype=np.int64)
+    pixel: FloatArray = column(2)
+    sigma: FloatArray = column()
 
 
 def _points(scene: Scene, seen: _Observed, straight: FloatArray, count: int, gates: TriangulationGates) -> PointMap:

@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: BSD-3-Clause
-# ruff: noqa: RUF009 - column() is dataclasses.field() with metadata
 """Cameras (calibrations), and the rigs that hold them."""
 
 from __future__ import annotations

@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: BSD-3-Clause
-# ruff: noqa: RUF009 - column() is dataclasses.field() with metadata
 """Frames (a rig at one moment) and the images taken by them."""
 
 from __future__ import annotations

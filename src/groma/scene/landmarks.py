@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: BSD-3-Clause
-# ruff: noqa: RUF009 - column() is dataclasses.field() with metadata
 """Landmarks in the world: points, lines, planes, directions."""
 
 from __future__ import annotations

@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: BSD-3-Clause
-# ruff: noqa: RUF009 - column() is dataclasses.field() with metadata
 """Where along a line images support it: the intervals of its segment that were seen, one landmark for all of them.
 
 The joints left and right of a window may lie on one line, and bind as one in the adjustment, but between them there is

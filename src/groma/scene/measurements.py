@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: BSD-3-Clause
-# ruff: noqa: RUF009 - column() is dataclasses.field() with metadata
 """What was measured besides the places in the images: depths, stereo pairs, planes, poses.
 
 One table for each kind of measurement, one row for each measurement, with its standard deviation. A kind is added by a

@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: BSD-3-Clause
-# ruff: noqa: RUF009 - column() is dataclasses.field() with metadata
 """How cameras with a rolling shutter moved while their images were read."""
 
 from __future__ import annotations

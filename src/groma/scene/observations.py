@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: BSD-3-Clause
-# ruff: noqa: RUF009 - column() is dataclasses.field() with metadata
 """Points and segments found in the images, and which landmarks belong together."""
 
 from __future__ import annotations

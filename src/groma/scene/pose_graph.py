@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: BSD-3-Clause
-# ruff: noqa: RUF009 - column() is dataclasses.field() with metadata
 """A pose graph: poses, and measured motions between pairs of them."""
 
 from __future__ import annotations

@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: BSD-3-Clause
-# ruff: noqa: RUF009 - column() is dataclasses.field() with metadata
 """What instruments measured outside the images: poses, control points with marks, distances, directions, planes.
 
 Coordinates are in the world of the scene and its unit of length. A control point is a landmark of its own, beside the

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from groma._numba import loop
+from groma._rows import Rows, column
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.features.edge_fit import measure_edges
 from groma.features.images import GrayImage
@@ -62,34 +63,16 @@ def coarse_flow(image_1: GrayImage, image_2: GrayImage, reduction: int) -> Flow:
     return np.asarray(flow, np.float32) * np.array([width / size[0], height / size[1]], np.float32)
 
 
-@dataclass(frozen=True)
-class FollowedSegments:
+@dataclass(frozen=True, eq=False)
+class FollowedSegments(Rows):
     """Segments of known lines in a frame."""
 
     #: (n,) landmark of each.
-    index: IntArray
+    index: IntArray = column(dtype=np.int64)
     #: (n, 4) segments, (n,) standard deviation and edge strength.
-    ends: FloatArray
-    sigma: FloatArray
-    strength: FloatArray
-
-    def joined(self, other: FollowedSegments) -> FollowedSegments:
-        """Return both together."""
-        return FollowedSegments(
-            np.concatenate([self.index, other.index]),
-            np.concatenate([self.ends, other.ends]),
-            np.concatenate([self.sigma, other.sigma]),
-            np.concatenate([self.strength, other.strength]),
-        )
-
-    def take(self, rows: IntArray | BoolArray) -> FollowedSegments:
-        """Return some of them."""
-        return FollowedSegments(self.index[rows], self.ends[rows], self.sigma[rows], self.strength[rows])
-
-    @staticmethod
-    def empty() -> FollowedSegments:
-        """Return none."""
-        return FollowedSegments(np.zeros(0, np.int64), np.zeros((0, 4)), np.zeros(0), np.zeros(0))
+    ends: FloatArray = column(4)
+    sigma: FloatArray = column()
+    strength: FloatArray = column()
 
 
 def carried(

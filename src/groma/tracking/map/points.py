@@ -8,36 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from groma._typing import BoolArray, FloatArray, IntArray
+from groma._rows import Rows, column
+from groma._typing import FloatArray, IntArray
 from groma.features.point_tracks import follow
 from groma.tracking.frame.camera import TrackCamera, into
 from groma.tracking.gates import PointGates
 from groma.tracking.map.track_map import TrackMap
 
 
-@dataclass(frozen=True)
-class PointTracks:
+@dataclass(frozen=True, eq=False)
+class PointTracks(Rows):
     """Points of the map in a frame."""
 
     #: (n,) landmark, (n, 2) pixel.
-    index: IntArray
-    pixel: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.index)
-
-    def take(self, rows: IntArray | BoolArray) -> PointTracks:
-        """Return some of them."""
-        return PointTracks(self.index[rows], self.pixel[rows])
-
-    def joined(self, other: PointTracks) -> PointTracks:
-        """Return both together."""
-        return PointTracks(np.concatenate([self.index, other.index]), np.concatenate([self.pixel, other.pixel]))
-
-    @staticmethod
-    def empty() -> PointTracks:
-        """Return none."""
-        return PointTracks(np.zeros(0, np.int64), np.zeros((0, 2)))
+    index: IntArray = column(dtype=np.int64)
+    pixel: FloatArray = column(2)
 
 
 def follow_points(

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Values that are columns of equal length: choosing rows, putting rows together, none at all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from groma._typing import BoolArray, IntArray
+
+
+def column(*shape: int, dtype: npt.DTypeLike = np.float64) -> Any:
+    """Declare a column of :class:`Rows`: the shape of one row, and the type of its numbers."""
+    return field(metadata={"shape": shape, "dtype": dtype})
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """A row an item; every field is declared with :func:`column`."""
+
+    def __len__(self) -> int:
+        return len(next(iter(vars(self).values())))
+
+    def take(self, rows: IntArray | BoolArray) -> Self:
+        """Return some rows: indices or a mask."""
+        return type(self)(*[values[rows] for values in vars(self).values()])
+
+    def joined(self, other: Self) -> Self:
+        """Return these rows and others."""
+        return self.stack([self, other])
+
+    @classmethod
+    def stack(cls, parts: Sequence[Self]) -> Self:
+        """Return the rows of several values, one after the other."""
+        names = [item.name for item in fields(cls)]
+        return (
+            cls(*[np.concatenate([getattr(part, name) for part in parts]) for name in names]) if parts else cls.empty()
+        )
+
+    @classmethod
+    def empty(cls) -> Self:
+        """Return no rows."""
+        kinds = [item.metadata for item in fields(cls)]
+        return cls(*[np.zeros((0, *kind["shape"]), kind["dtype"]) for kind in kinds])

@@ -1,0 +1,41 @@
+"""Columns of equal length: choosing rows, putting rows together, none at all."""
+
+import numpy as np
+
+from groma._rows import Rows
+from groma.tracking.frame.measurements import LineMeasurements, PlaneMeasurements, PointMeasurements
+from groma.tracking.map.lines import FollowedSegments
+
+SEGMENTS = FollowedSegments(np.arange(3), np.arange(12.0).reshape(3, 4), np.ones(3), np.array([5.0, 6.0, 7.0]))
+
+
+def test_rows_are_chosen_by_index_and_by_mask():
+    for rows in ([2, 0], np.array([True, False, True])):
+        chosen = SEGMENTS.take(np.asarray(rows))
+        np.testing.assert_array_equal(chosen.ends, SEGMENTS.ends[rows])
+        np.testing.assert_array_equal(chosen.index, SEGMENTS.index[rows])
+        assert isinstance(chosen, FollowedSegments) and len(chosen) == 2
+
+
+def test_rows_are_put_together_in_order():
+    both = SEGMENTS.joined(SEGMENTS.take(np.array([1])))
+    np.testing.assert_array_equal(both.strength, [5.0, 6.0, 7.0, 6.0])
+    assert FollowedSegments.stack([SEGMENTS, SEGMENTS]).ends.shape == (6, 4)
+
+
+def test_no_rows_have_the_shape_and_type_of_rows():
+    nothing = FollowedSegments.empty()
+    assert len(nothing) == len(FollowedSegments.stack([])) == 0
+    assert nothing.ends.shape == (0, 4) and nothing.index.dtype == np.int64
+    joined = nothing.joined(SEGMENTS)
+    assert all(getattr(joined, name).dtype == value.dtype for name, value in vars(SEGMENTS).items())
+
+
+def test_every_table_of_measurements_can_be_empty():
+    kinds: list[type[Rows]] = [PointMeasurements, LineMeasurements, PlaneMeasurements]
+    shapes = [[value.shape for value in vars(kind.empty()).values()] for kind in kinds]
+    assert shapes == [
+        [(0,), (0, 2), (0,), (0,), (0,), (0, 2)],
+        [(0,), (0, 4), (0,), (0, 2), (0, 2)],
+        [(0,), (0, 4), (0, 3, 3)],
+    ]
