@@ -131,6 +131,17 @@ def test_depths_of_segments_in_images_with_distortion(exact):
     assert cost(scene.replace(**shifted), **only) == pytest.approx(cost(exact.replace(**shifted), **only), rel=0.3)
 
 
+def test_segments_that_hold_a_calibration_are_told(exact):
+    """Rays are made once, so what lines say of an estimated calibration is not true; in pinhole images they are not."""
+    old = exact.cameras
+    params = np.hstack([old.params, np.zeros((1, 4))])
+    cameras = Cameras(old.ids, ("OPENCV",), params, old.width, old.height)
+    bent = exact.replace(cameras=cameras, right_columns=type(exact.right_columns)())
+    for scene, refined, told in ((bent, True, True), (bent, False, False), (exact, True, False)):
+        notes = assemble(scene, AssemblyOptions(refine_intrinsics=refined)).notes
+        assert any("They hold it" in note for note in notes) == told
+
+
 def test_right_columns_without_a_left_image_in_pinhole_form_are_left_out(exact):
     old = exact.cameras
     cameras = Cameras(old.ids, ("RADIAL",), [[*old.params[0, [0, 2, 3]], 0.01, 0.0]], old.width, old.height)

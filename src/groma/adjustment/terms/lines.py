@@ -70,6 +70,11 @@ def _factors(draft: Draft) -> Iterator[Group]:
             )
             yield Group(factor, observes="lines")
             continue
+        if options.refine_intrinsics:
+            draft.notes.append(
+                f"Segments in images of {name} cameras are rays of the calibration at the start. They hold it, and "
+                "standard deviations come out too small; those without lines (--no-lines, lines=False) are true."
+            )
         rays = _rays(draft, name, rows)
         make = _normals if options.line_residual == "normal" else _sines
         yield make(draft, rays, sigma[rays.rows])
