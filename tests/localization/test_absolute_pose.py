@@ -12,7 +12,7 @@ from worlds import CAMERA, make_world, project
 import groma
 from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion, se3, so3
-from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose
+from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose, pose_from_matches
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.gates import REFINEMENT
 from groma.localization.pose.hypotheses import max_errors
@@ -251,6 +251,18 @@ def test_a_wrong_focal_length_is_noticed(kinds, share):
     estimated = of(world, kinds.split(), told, sigma=(0.5, 0.5), options=PoseOptions(refine_lens=True))
     assert estimated.status == "localized"
     np.testing.assert_allclose(estimated.camera.params[:2], CAMERA.params[:2], rtol=0.01)
+
+
+def test_poses_with_too_few_votes_are_not_judged():
+    """What else would be asked of them is not."""
+    world = make_world(np.random.default_rng(2), points=200)
+    matches = Matches(world.points2d, world.points3d)
+    votes = pose_from_matches(CAMERA, matches).votes
+    asked = []
+    for enough in (votes, votes + 1):
+        expected = lambda best: asked.append(best) or ((9.0, 0.0), 1.0)  # noqa: E731
+        found = pose_from_matches(CAMERA, matches, expected=expected, enough=enough)
+        assert (found.status, len(asked)) == ("localized" if enough == votes else "failed", 1)
 
 
 def test_what_is_put_together_of_pieces_is_not_believed():

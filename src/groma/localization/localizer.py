@@ -182,7 +182,7 @@ class Localizer:
             described = time.perf_counter()
             images = self._alike(query.points)
             pose, last = self._coarsely(query, camera, options, images)
-            if pose.status != "localized" or pose.votes < self.options.gates.plain:
+            if pose.status != "localized":
                 pose, last = self._fully(query, camera, options, images)
         done = time.perf_counter()
         return LocalizedImage(pose, last.points[:, 1], last.lines[:, 1], described - start, done - described)
@@ -194,7 +194,8 @@ class Localizer:
         def matched(points: DescribedPoints, images: IntArray) -> Candidates:
             return Candidates(self._landmarks.match(points, seen_in(self.index, images)), np.zeros((0, 2), np.int64))
 
-        return self._pose(query, few, camera, options, images, matched(few.points, images), matched)
+        enough = self.options.gates.plain
+        return self._pose(query, few, camera, options, images, matched(few.points, images), matched, enough)
 
     def _fully(self, query: DescribedImage, camera: QueryCamera, options: PoseOptions, images: IntArray) -> _Found:
         """Match everything, lines too, with one image after the other."""
@@ -214,6 +215,7 @@ class Localizer:
         images: IntArray,
         found: Candidates,
         matched: Callable[[DescribedPoints, IntArray], Candidates],
+        enough: int = 0,
     ) -> _Found:
         """The pose from matches of a part of a query, those that it guides to, and what mirrored points match."""
         near = nearest_images(self.index, images, found.points[:, 1], self.options.gates.near)
@@ -242,7 +244,7 @@ class Localizer:
             self.options.gates.near,
         )  # fmt: skip
         asked = MirrorQuestions(mirror.matches, closest)
-        pose = pose_from_matches(camera, matches, options, max(len(images), 1), guided, asked, expected)
+        pose = pose_from_matches(camera, matches, options, max(len(images), 1), guided, asked, expected, enough)
         return pose, last[0]
 
     @staticmethod

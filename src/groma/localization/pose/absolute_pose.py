@@ -194,6 +194,7 @@ def pose_from_matches(
     guided: Callable[[Refined], Matches] | None = None,
     mirror: MirrorQuestions | None = None,
     expected: Callable[[Refined], tuple[tuple[float, float], float]] | None = None,
+    enough: int = 0,
 ) -> AbsolutePose:
     """Estimate a pose as :func:`estimate_absolute_pose` does.
 
@@ -211,6 +212,8 @@ def pose_from_matches(
     expected : callable, optional
         Returns how many parts of the image show what a pose puts there, and how many show none of it; and how often
         what only this place has is found, as a share of how often all of it is.
+    enough
+        A pose with fewer votes is of no interest: it is ``failed``, without asking what else speaks against it.
     """
     options = options or PoseOptions()
     best = _best(camera, matches, options)
@@ -218,7 +221,7 @@ def pose_from_matches(
         return _failed(camera, matches)
     first = evidence_of(best, matches, places)
     own = best
-    other = _rival(matches, best, options, places, first) if options.look_for_rival and first.significant else None
+    rival_of = (best, first) if options.look_for_rival and first.significant else None
     used = matches
     if guided is not None and first.significant:
         used = guided(best)
@@ -226,6 +229,9 @@ def pose_from_matches(
         best = refine(best.camera, used, best.pose, errors, options.lens, gathered=True)
         own = fitted(best.camera, matches, best.pose, errors, options.lens)
         first = evidence_of(own, matches, places)
+    if first.agree < enough:
+        return _failed(camera, matches)
+    other = None if rival_of is None else _rival(matches, rival_of[0], options, places, rival_of[1])
     covariance = best.covariance(used)
     distance = median_distance(best.pose, _seen(used, best))
     verdict = judge(best, covariance, distance, first, None if other is None else other[1])
