@@ -56,7 +56,7 @@ def test_true_poses_come_back(rng, planar):
 def test_the_start_is_the_cheaper_of_poses_and_motions(rng):
     """From zero, as from poses far off, the motions lead; near the minimum, or where poses are held, the poses do."""
     truth, graph = ring(rng, count=40, noise=0.01)
-    zero = np.tile([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], (40, 1))
+    zero = np.tile(se3.identity(), (40, 1))
     unknown = graph.replace(poses=graph.poses.replace(world_from_body=zero))
     result = adjust_pose_graph(unknown)
     assert result.from_motions and result.summary()["from_motions"]
