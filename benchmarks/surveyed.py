@@ -371,7 +371,7 @@ def main() -> None:
     if arguments.deviations:
         columns = DEVIATIONS
     # All lines take part in the adjustment; the improbable ones are left out after it.
-    options = MapOptions(min_confidence=0.0) if arguments.deviations or arguments.draws else MapOptions()
+    options = MapOptions(min_confidence=0.0)
     tell = tell_deviations if arguments.deviations else tell_noise
     print("| scene | " + " | ".join(columns) + " |\n|---|" + "--:|" * len(columns))
     for folder in arguments.scenes:
