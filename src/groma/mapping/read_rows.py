@@ -198,12 +198,8 @@ def _segments_at_once(scene: Scene, image: int, segments: Segments, distance: Fl
 
 def _project(scene: Scene, image_idx: IntArray, inside: FloatArray) -> FloatArray:
     pixels = np.full((len(inside), 2), np.nan)
-    camera = scene.images.camera_idx[image_idx]
-    for name, members in scene.cameras.by_model().items():
-        rows = np.flatnonzero(np.isin(camera, members))
-        if len(rows):
-            params = _params(scene, image_idx[rows], name)
-            pixels[rows] = camera_model(name).project(params, np.ascontiguousarray(inside[rows]))
+    for model, rows, params in scene.cameras.rows_by_model(scene.images.camera_idx[image_idx]):
+        pixels[rows] = model.project(params, np.ascontiguousarray(inside[rows]))
     return pixels
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,6 +63,14 @@ class Cameras(Table, noun="camera"):
         """Return the rows of the cameras of each model."""
         models = np.array(self.models, dtype=object)
         return {str(name): np.flatnonzero(models == name) for name in dict.fromkeys(models)}
+
+    def rows_by_model(self, camera_idx: IntArray) -> Iterator[tuple[camera_models.CameraModel, IntArray, FloatArray]]:
+        """Yield (model, rows (n,) of ``camera_idx`` of its cameras, their parameters (n, k)) for each camera model."""
+        for name, members in self.by_model().items():
+            rows = np.flatnonzero(np.isin(camera_idx, members))
+            if len(rows):
+                model = camera_models.model(name)
+                yield model, rows, np.ascontiguousarray(self.params[camera_idx[rows], : model.num_parameters])
 
     def with_model(self, name: str) -> Cameras:
         """Return the same cameras in another model that can hold them; parameters that it adds are zero.

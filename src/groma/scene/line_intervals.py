@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.cameras import model as camera_model
 from groma.errors import InputError
 from groma.geometry import quaternion
 from groma.geometry.algebra import dot, ratio
@@ -106,12 +105,8 @@ def shares_on_lines(
     """
     poses = scene.cam_from_world[image_idx]
     bearing = np.full((len(pixels), 3), np.nan)
-    camera = scene.images.camera_idx[image_idx]
-    for name in dict.fromkeys(scene.cameras.models):
-        rows = np.flatnonzero(np.array([one == name for one in scene.cameras.models])[camera])
-        model = camera_model(name)
-        params = scene.cameras.params[camera[rows], : model.num_parameters]
-        bearing[rows] = model.unproject(np.ascontiguousarray(params), np.ascontiguousarray(pixels[rows]))
+    for model, rows, params in scene.cameras.rows_by_model(scene.images.camera_idx[image_idx]):
+        bearing[rows] = model.unproject(params, np.ascontiguousarray(pixels[rows]))
     ray = quaternion.rotate(quaternion.conjugate(poses[:, :4]), bearing)
     center = -quaternion.rotate(quaternion.conjugate(poses[:, :4]), poses[:, 4:])
     along = segments[:, 1] - segments[:, 0]

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from groma import cameras
 from groma._typing import FloatArray, IntArray
 from groma.geometry import se3
 from groma.geometry.incidence import closest_points
@@ -144,14 +143,8 @@ def _by_camera(
 ) -> FloatArray:
     """Call ``function(model, params, rows)`` once per camera model, with a row of parameters per observation."""
     result = np.full((len(image_idx), 2), np.nan)
-    camera_idx = scene.images.camera_idx[image_idx]
-    names = np.array(scene.cameras.models)
-    for name in sorted(set(scene.cameras.models)):
-        model = cameras.model(name)
-        rows = np.flatnonzero((names == name)[camera_idx])
-        if len(rows):
-            params = scene.cameras.params[camera_idx[rows], : model.num_parameters]
-            result[rows] = function(model, np.ascontiguousarray(params), rows)
+    for model, rows, params in scene.cameras.rows_by_model(scene.images.camera_idx[image_idx]):
+        result[rows] = function(model, params, rows)
     return result
 
 

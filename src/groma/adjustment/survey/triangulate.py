@@ -13,7 +13,6 @@ from itertools import combinations
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray
-from groma.cameras import model as camera_model
 from groma.geometry import quaternion
 from groma.geometry.algebra import unit
 from groma.scene import Marks, Scene
@@ -39,13 +38,8 @@ def triangulated(scene: Scene, marks: Marks, count: int) -> tuple[FloatArray, Bo
 def rays_of(scene: Scene, marks: Marks) -> FloatArray:
     """Return unit directions (M, 3) of marks in the world; NaN outside the range of a camera."""
     rays = np.full((len(marks), 3), np.nan)
-    camera = scene.images.camera_idx[marks.image_idx]
-    for name, members in scene.cameras.by_model().items():
-        rows = np.flatnonzero(np.isin(camera, members))
-        if len(rows):
-            model = camera_model(name)
-            params = np.ascontiguousarray(scene.cameras.params[camera[rows], : model.num_parameters])
-            rays[rows] = model.unproject(params, np.ascontiguousarray(marks.pixel[rows]))
+    for model, rows, params in scene.cameras.rows_by_model(scene.images.camera_idx[marks.image_idx]):
+        rays[rows] = model.unproject(params, np.ascontiguousarray(marks.pixel[rows]))
     turn = quaternion.conjugate(scene.cam_from_world[marks.image_idx, :4])
     return unit(quaternion.rotate(turn, rays))
 

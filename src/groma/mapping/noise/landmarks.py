@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.cameras import model as camera_model
 from groma.execution import map_ranges
 from groma.gates import gate
 from groma.geometry import quaternion
@@ -233,8 +232,7 @@ def _projected(
     poses = scene.cam_from_world[image_idx]
     in_cam = quaternion.rotate(poses[:, :4], places) + poses[:, 4:]
     in_cam[:, 0] -= baseline
-    for name, rows, params in _by_model(scene, image_idx):
-        model = camera_model(name)
+    for model, rows, params in scene.cameras.rows_by_model(scene.images.camera_idx[image_idx]):
         seen = model.sees_behind | (in_cam[rows, 2] > 0)
         pixels, by_cam, _ = model.project_jacobian(params[seen], np.ascontiguousarray(in_cam[rows[seen]]))
         yield rows[seen], pixels, by_cam
@@ -268,8 +266,8 @@ def _depth_rows(scene: Scene) -> tuple[IntArray, FloatArray, FloatArray]:
 def pixel_differences(scene: Scene, image_idx: IntArray, first: FloatArray, second: FloatArray) -> FloatArray:
     """Differences (N, 2) of pixels, in panoramas the short way round."""
     difference = first - second
-    for name, rows, params in _by_model(scene, image_idx):
-        difference[rows] = camera_model(name).pixel_difference(params, first[rows], second[rows])
+    for model, rows, params in scene.cameras.rows_by_model(scene.images.camera_idx[image_idx]):
+        difference[rows] = model.pixel_difference(params, first[rows], second[rows])
     return difference
 
 
@@ -278,15 +276,6 @@ def _share_on_line(scene: Scene, image_idx: IntArray, measured: FloatArray, ends
     share = shares_on_lines(scene, image_idx, measured, ends, min_squared_sine=1e-12)
     # Rays nearly along the line say nothing; far points would only disturb.
     return np.where(np.abs(share - 0.5) < GATES.max_share, share, np.nan)
-
-
-def _by_model(scene: Scene, image_idx: IntArray):
-    """Yield (model name, rows, parameters (n, k) of the rows)."""
-    camera = scene.images.camera_idx[image_idx]
-    for name in dict.fromkeys(scene.cameras.models):
-        rows = np.flatnonzero(np.array([one == name for one in scene.cameras.models])[camera])
-        if len(rows):
-            yield name, rows, scene.cameras.params[camera[rows], : camera_model(name).num_parameters]
 
 
 def _misfit(squares: FloatArray, freedom: IntArray, sigma_px: float | None) -> tuple[float, FloatArray]:
