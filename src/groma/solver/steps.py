@@ -84,7 +84,8 @@ def share_of_states(step: FloatArray, states: FloatArray) -> float:
     moved = step > 0.0
     if not moved.any():
         return 0.0
-    return float(np.sqrt(np.max(step[moved] / np.maximum(states[moved], np.finfo(float).tiny))))
+    with np.errstate(over="ignore"):  # states that are all zero: no share is larger
+        return float(np.sqrt(np.max(step[moved] / np.maximum(states[moved], np.finfo(float).tiny))))
 
 
 def sizes_of(layout: Layout, states: States) -> FloatArray:
