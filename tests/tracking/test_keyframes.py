@@ -71,6 +71,23 @@ def test_what_is_worked_out_is_taken_up_before_a_frame_is_searched():
     tracker.finish()
 
 
+@pytest.mark.parametrize(("rate", "frames"), [(10.0, 2), (30.0, 3), (60.0, 4)])
+def test_a_keyframe_waits_for_its_features_by_the_clock_of_the_camera(rate, frames):
+    """Two frames at least, and with 45 ms three at 30 frames a second and four at 60; nobody looks at another clock."""
+    tracker = Tracker(_room.camera(), OPTIONS)
+    made, chosen = [], []
+    for k, frame in enumerate(_room.frames("rgbd", _room.poses(14, turn=0.04), rate)):
+        if tracker.process(frame).keyframe and k:
+            chosen.append(k)
+        made.append(len(tracker.map.keyframes))  # waits for what goes on behind the answer
+    assert chosen
+    steps = np.flatnonzero(np.diff(made)) + 1
+    # Behind the answer of the last of these frames, so that the one after it is followed with the keyframe.
+    np.testing.assert_array_equal(steps, np.array(chosen)[: len(steps)] + frames - 1)
+    assert len(steps) >= 1
+    tracker.finish()
+
+
 def test_features_are_described_in_all_parts_of_an_image():
     """Bars of high contrast on the left would take all features; what is on the right has a tenth of their contrast."""
     rng = np.random.default_rng(3)

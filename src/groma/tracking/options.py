@@ -46,8 +46,8 @@ class TrackOptions:
     adjust_at_end: bool = True
     #: Use relations between landmarks that the data support: lines on planes, parallel and perpendicular planes.
     relations: bool = True
-    #: Work in several threads; the result is the same. A keyframe and the adjustment of its window are taken up two
-    #: frames later, with threads or without.
+    #: Work in several threads; the result is the same. A keyframe (not before 45 ms by the time stamps) and the
+    #: adjustment of its window are taken up two frames later, with threads or without.
     threaded: bool = True
     #: Tuned numbers: thresholds, with unit, meaning and origin.
     gates: TrackingGates = field(default_factory=TrackingGates)

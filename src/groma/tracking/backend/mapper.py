@@ -37,9 +37,6 @@ from groma.tracking.pose.following import carry, find_points_again
 from groma.tracking.result import map_to_scene
 from groma.tracking.stopwatch import Stopwatch
 
-#: A chosen frame becomes a keyframe, and the result of a window's adjustment is taken up, after this many frames.
-DELAY = 2
-
 
 @dataclass
 class Present:
@@ -61,10 +58,12 @@ class _Chosen:
     followed: Followed
     age: int = 0
 
-    def is_ready(self, delay: int) -> bool:
-        """Whether frames have passed in which its features were found. Counted, so that runs repeat exactly."""
+    def is_ready(self, now: float, delay: int, seconds: float) -> bool:
+        """Whether frames have passed in which its features were found: so many, and so many seconds by the camera's
+        clock. No other clock is looked at, so that runs repeat exactly.
+        """
         self.age += 1
-        return self.age >= delay
+        return self.age >= delay and now - self.data.frame.timestamp >= seconds
 
 
 @dataclass
@@ -166,8 +165,11 @@ class Mapper:
             self.make_keyframe(present, watch)
         with watch("take up"):
             self.take_up(present)
-        if self.due is not None and self.due.is_ready(DELAY if self.metric else 1):
-            self.make_keyframe(present, watch)
+        if self.due is not None and present.data is not None:
+            gates, now = self.options.gates.keyframes, present.data.frame.timestamp
+            # The points of a single camera get their places from keyframes alone.
+            if self.due.is_ready(now, *((gates.delay, gates.delay_seconds) if self.metric else (1, 0.0))):
+                self.make_keyframe(present, watch)
         return watch
 
     def adjust_start(self, present: Present) -> None:
@@ -228,7 +230,7 @@ class Mapper:
         with watch("adjust"):
             job = window_job(self.map, self.camera, self.options.window, self.options.relations, self.metric)
             if job is not None:
-                self._pending = _Pending(job, self._begin(job.solve), DELAY)
+                self._pending = _Pending(job, self._begin(job.solve), self.options.gates.keyframes.delay)
         with watch("loop"):
             search = self._what_to_search() if self.options.close_loops else None
             if search is not None and self._search is None:

@@ -19,6 +19,12 @@ class KeyframeGates:
     nearby: float = gate(
         0.5, "share", "share of the motion of a keyframe within which an older one stands for it", SEQUENCES
     )
+    delay: int = gate(
+        2, "frames", "after which what threads worked out is taken up: a keyframe, a window", "cost: waiting for it"
+    )
+    delay_seconds: float = gate(
+        0.045, "s", "of the camera's clock before a keyframe is made, for its features", "cost: waiting for them"
+    )
 
 
 @dataclass(frozen=True)

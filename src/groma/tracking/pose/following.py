@@ -48,11 +48,15 @@ def follow_frame(
     watch,
     pool: Executor | None = None,
 ) -> tuple[PoseEstimate | None, Followed]:
-    """Return the pose of a frame that follows another, and what is still followed; lines beside points in a pool."""
+    """Return the pose of a frame that follows another, and what is still followed.
+
+    Lines and planes are found beside points in a pool.
+    """
     camera, options, gates = data.camera, data.options, data.options.gates
     tracks, segments = followed.points, followed.lines
     with_lines = options.lines and len(segments.index) > 0
     lines_followed = beside(pool if with_lines else None, partial(follow_lines, track_map, before, data, segments))
+    planes_found = beside(pool if data.frame.depth is not None else None, lambda: data.planes)
     with watch("points"):
         tracks = tracks.take(track_map.points.state[tracks.index] != DEAD)
         if options.points:
@@ -71,7 +75,7 @@ def follow_frame(
             lines = measure_lines(track_map, data, segments, few_points=len(measured) < gates.lines.few_points)
     with watch("planes"):
         planes = PlaneMeasurements.empty()
-        if data.planes is not None:
+        if planes_found() is not None:
             planes = match_planes(track_map, data, predicted, gates.planes.wide_angle, gates.planes.wide_distance)
     if len(measured) + 2 * len(lines) + 3 * len(planes) < gates.verification.min_followed:
         return None, Followed.nothing()
