@@ -42,7 +42,14 @@ TIED |= {"segment_on_plane_pixels", "vector_prior", "on_known_plane"}
 TURNED = {"camera_direction", "known_direction"}
 WITHOUT_SIZE = {name for name in NAMES if name.startswith(("parallel_", "orthogonal_")) or "_parallel_" in name}
 WITHOUT_SIZE |= {name for name in NAMES if "_perpendicular_" in name}
-WITHOUT_SIZE |= {"line_bearing", "line_direction", "line_normal", "line_reprojection", "line_to_pixel"}
+WITHOUT_SIZE |= {
+    "line_bearing",
+    "line_unprojection",
+    "line_direction",
+    "line_normal",
+    "line_reprojection",
+    "line_to_pixel",
+}
 WITHOUT_SIZE |= {"point_on_plane_pixels", "point_reprojection", "point_to_image_line", "similarity_between", *TURNED}
 
 

@@ -35,6 +35,7 @@ from groma.adjustment.terms import (
     right_columns,
 )
 from groma.adjustment.terms.contract import Draft, Group, Term
+from groma.adjustment.terms.lines import LINE_FACTORS
 from groma.adjustment.terms.objects import with_held
 from groma.adjustment.terms.open_motions import coordinates_to_hold
 from groma.adjustment.terms.readout import MOTIONS
@@ -71,9 +72,8 @@ TERMS: tuple[Term, ...] = (
     known_geometry.PLANES,
     known_geometry.DIRECTIONS,
 )
-#: Types of factors that are observations of points and of lines in images.
+#: Types of factors that are observations of points in images.
 POINT_FACTORS = ("point_reprojection", "stereo_point")
-LINE_FACTORS = ("line_reprojection", "line_bearing", "line_normal")
 #: A point this many times farther away than its cameras from each other moves linearly in its inverse depth.
 FAR_FROM_CAMERAS = 2.0
 

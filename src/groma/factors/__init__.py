@@ -34,6 +34,7 @@ from groma.factors.losses import (
 from groma.factors.observations.line_bearing import LineBearing
 from groma.factors.observations.line_normal import LineNormal
 from groma.factors.observations.line_reprojection import LineReprojection
+from groma.factors.observations.line_unprojection import LineUnprojection
 from groma.factors.observations.plane_observation import PlaneObservation
 from groma.factors.observations.plane_quaternion import PlaneQuaternion
 from groma.factors.observations.point_depth import PointDepth
@@ -95,6 +96,7 @@ __all__ = [
     "LinePerpendicularToPlane",
     "LineReprojection",
     "LineToPixel",
+    "LineUnprojection",
     "LinesMeeting",
     "Loss",
     "OnKnownPlane",

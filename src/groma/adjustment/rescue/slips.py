@@ -23,12 +23,13 @@ from groma.adjustment.rescue.restart import GATES as RESTART_GATES
 from groma.estimators.trimming import trim_to_ray
 from groma.factors.observations.line_bearing import LineBearing
 from groma.factors.observations.line_reprojection import LineReprojection
+from groma.factors.observations.line_unprojection import LineUnprojection
 from groma.gates import gate
 from groma.problem.problem import Problem
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 
-Observing = LineReprojection | LineBearing
+Observing = LineReprojection | LineBearing | LineUnprojection
 
 
 @dataclass(frozen=True)

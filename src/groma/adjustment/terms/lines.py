@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -38,6 +39,7 @@ from groma.factors.contract import Ref
 from groma.factors.observations.line_bearing import LineBearing
 from groma.factors.observations.line_normal import LineNormal
 from groma.factors.observations.line_reprojection import LineReprojection
+from groma.factors.observations.line_unprojection import LineUnprojection
 from groma.geometry import quaternion
 from groma.geometry.algebra import unit
 
@@ -45,7 +47,7 @@ from groma.geometry.algebra import unit
 #: ``normal``: both parts of the residual then say the same.
 MIN_SINE = 1e-3
 #: Types of the factors of segments.
-LINE_FACTORS = ("line_reprojection", "line_bearing", "line_normal")
+LINE_FACTORS = ("line_reprojection", "line_bearing", "line_unprojection", "line_normal")
 
 
 def line_sigma_px(draft: Draft) -> FloatArray:
@@ -70,11 +72,6 @@ def _factors(draft: Draft) -> Iterator[Group]:
             )
             yield Group(factor, observes="lines")
             continue
-        if options.refine_intrinsics:
-            draft.notes.append(
-                f"Segments in images of {name} cameras are rays of the calibration at the start. They hold it, and "
-                "standard deviations come out too small; those without lines (--no-lines, lines=False) are true."
-            )
         rays = _rays(draft, name, rows)
         make = _normals if options.line_residual == "normal" else _sines
         yield make(draft, rays, sigma[rays.rows])
@@ -115,15 +112,24 @@ def _sines(draft: Draft, rays: _Rays, sigma: FloatArray) -> Group:
     table, lines, places = draft.scene.line_observations, draft.scene.lines.plucker, _places(draft, rays.rows)
     both = rays.pixels.ndim == 2
     pixels = rays.pixels[:, :, None] * np.eye(2) if both else rays.pixels
-    factor = LineBearing(
-        line=Ref("lines", table.line_idx[rays.rows]),
-        start_bearings=rays.first,
-        end_bearings=rays.second,
-        sqrt_information=pixels / (sigma[:, None, None] if both else sigma),
-        loss=draft.line_loss,
-        **draft.camera_refs(table.image_idx[rays.rows]),
-        **line_refs(draft, rays.model, table.image_idx[rays.rows], lines[table.line_idx[rays.rows]], places),
-    )
+    image_idx, line_idx = table.image_idx[rays.rows], table.line_idx[rays.rows]
+    follows = draft.options.refine_intrinsics and len(rays.rows) > 0
+    if follows and camera_model(rays.model).is_planar:
+        focal = camera_model(rays.model).focal_length(draft.params(rays.model, image_idx))
+        pixels = pixels / (focal[:, None, None] if both else focal)
+    common: dict[str, Any] = {
+        "line": Ref("lines", line_idx),
+        "sqrt_information": pixels / (sigma[:, None, None] if both else sigma),
+        "loss": draft.line_loss,
+        **line_refs(draft, rays.model, image_idx, lines[line_idx], places),
+    }
+    factor: LineBearing | LineUnprojection
+    if follows:
+        camera = next(camera for _, _, camera in draft.by_camera(image_idx))
+        factor = LineUnprojection(segments=np.hstack(places), **camera, **common)
+    else:
+        refs = draft.camera_refs(image_idx)
+        factor = LineBearing(start_bearings=rays.first, end_bearings=rays.second, **refs, **common)
     return Group(factor, observes="lines", pixels_of_residual=pixels)
 
 
@@ -135,6 +141,11 @@ def _places(draft: Draft, rows: IntArray) -> tuple[FloatArray, FloatArray]:
 
 def _normals(draft: Draft, rays: _Rays, sigma: FloatArray) -> Group:
     scene, table = draft.scene, draft.scene.line_observations
+    if draft.options.refine_intrinsics:
+        draft.notes.append(
+            "With line_residual='normal' segments are rays of the calibration at the start: they hold it, and standard "
+            "deviations come out too small. Use endpoints or bearing."
+        )
     if len(scene.camera_motions):
         raise InputError("line_residual='normal' knows no rolling shutter. Use endpoints or bearing.")
     first, second = unit(rays.first), unit(rays.second)

@@ -11,9 +11,9 @@ With the moment :math:`m_c = R m + t \times R d` of the line in the camera, and 
           \frac{\partial r_i}{\partial (m, d)} = [\,g^\top R,\; (g \times t)^\top R\,]
 
 for the left twist :math:`(\rho, \omega)`. Bearings come from any camera model
-(:meth:`groma.cameras.CameraModel.unproject`), so this is the line factor under distortion, and for fisheye cameras; the
-parameters of the camera are not estimated. Multiply by the focal length, through ``sqrt_information``, to get about
-pixels.
+(:meth:`groma.cameras.CameraModel.unproject`), so this is the line factor under distortion, and for fisheye cameras. The
+parameters of the camera are held; :mod:`groma.factors.observations.line_unprojection` estimates them. Multiply by the
+focal length, through ``sqrt_information``, to get about pixels.
 
 Source: the motion of the line is Plücker notes, eq. (65); the residual is the one of eq. (76) on the unit sphere. It
 does not depend on the scale of (m, d), and changes its sign with that of (m, d).
@@ -46,7 +46,7 @@ from groma.factors.contract import ANY_SIMILARITY, Example, Invariance, Ref, Slo
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
 @kernel
-def _bearing_sine(L, k, bearings, i, out):
+def bearing_sine(L, k, bearings, i, out):
     """Write r and g = dr/dm (3,) to ``out`` (4,); k = 1/|m|."""
     u0, u1, u2 = L[0] * k, L[1] * k, L[2] * k
     r = bearings[i, 0] * u0 + bearings[i, 1] * u1 + bearings[i, 2] * u2
@@ -67,9 +67,9 @@ def _linearize_all(poses, pose_index, lines, line_index, starts, ends, begin, en
         if valid and norm < math.inf:
             for row in range(2):
                 if row == 0:
-                    _bearing_sine(L, 1.0 / norm, starts, i, out)
+                    bearing_sine(L, 1.0 / norm, starts, i, out)
                 else:
-                    _bearing_sine(L, 1.0 / norm, ends, i, out)
+                    bearing_sine(L, 1.0 / norm, ends, i, out)
                 record[k, row, last] = out[0]
                 if pose_column >= 0:
                     put_line_pose(out[1], out[2], out[3], 0.0, 0.0, 0.0, L, record, k, row, pose_column)
