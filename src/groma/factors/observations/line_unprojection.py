@@ -29,7 +29,7 @@ from typing import ClassVar
 import numpy as np
 
 from groma._numba import loop
-from groma._typing import Columns, FloatArray, Inputs
+from groma._typing import BoolArray, Columns, FloatArray, Inputs
 from groma.factors._examples import indices
 from groma.factors._pixels import PixelFactor, pixel_example
 from groma.factors._rig import EXTRINSICS, MOTION, POSE, clear_record, put_line, put_line_pose, transform_line
@@ -121,10 +121,10 @@ class LineUnprojection(PixelFactor):
         _, by_ray, by_params = self.camera.project_jacobian(params, rays)
         equations = np.concatenate([by_ray, rays[:, None]], axis=1)
         known = np.concatenate([-by_params, np.zeros((len(rays), 1, by_params.shape[2]))], axis=1)
-        good = np.isfinite(equations).all(axis=(1, 2)) & np.isfinite(known).all(axis=(1, 2))
+        good: BoolArray = np.isfinite(equations).all(axis=(1, 2)) & np.isfinite(known).all(axis=(1, 2))
         good[good] = np.abs(np.linalg.det(equations[good])) > _SINGULAR
         rays[~good], equations[~good], known[~good] = np.nan, np.eye(3), 0.0
-        return rays, np.linalg.solve(equations, known)
+        return rays, np.asarray(np.linalg.solve(equations, known), np.float64)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102
