@@ -121,7 +121,7 @@ class LineUnprojection(PixelFactor):
         _, by_ray, by_params = self.camera.project_jacobian(params, rays)
         equations = np.concatenate([by_ray, rays[:, None]], axis=1)
         known = np.concatenate([-by_params, np.zeros((len(rays), 1, by_params.shape[2]))], axis=1)
-        good: BoolArray = np.isfinite(equations).all(axis=(1, 2)) & np.isfinite(known).all(axis=(1, 2))
+        good: BoolArray = np.asarray(np.isfinite(np.concatenate([equations, known], axis=2)).all(axis=(1, 2)))
         good[good] = np.abs(np.linalg.det(equations[good])) > _SINGULAR
         rays[~good], equations[~good], known[~good] = np.nan, np.eye(3), 0.0
         return rays, np.asarray(np.linalg.solve(equations, known), np.float64)
