@@ -110,7 +110,7 @@ def _tried(found: Candidates, rows: IntArray, most: FloatArray, part: float) -> 
         MEMBERSHIPS.rounds,
     )  # fmt: skip
     mixed = share[found.group[rows]] * density[rows] + (1.0 - share[found.group[rows]]) * found.clutter[rows]
-    return np.bincount(found.owner[rows], np.log(mixed), len(most)), share
+    return np.bincount(found.owner[rows], np.log(mixed), len(most)).astype(np.float64, copy=False), share
 
 
 def _density(found: Candidates, deviation: FloatArray) -> FloatArray:
