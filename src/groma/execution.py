@@ -195,6 +195,21 @@ def map_work(
     return results
 
 
+def map_largest_first(
+    function: Callable[[_Item], _Result],
+    items: Sequence[_Item],
+    sizes: Sequence[float],
+    progress: Callable[[int, int], None] | None = None,
+) -> list[_Result]:
+    """Do what :func:`map_work` does, the largest items first: at the end all workers then wait for a small one.
+
+    ``sizes`` are about in proportion to the time that the items take.
+    """
+    order = sorted(range(len(items)), key=lambda place: -sizes[place])
+    found = map_work(function, [items[place] for place in order], progress)
+    return [result for _, result in sorted(zip(order, found, strict=True), key=lambda pair: pair[0])]
+
+
 def map_in_threads(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_Result]:
     """Do what :func:`map_work` does in threads of this process.
 
