@@ -292,10 +292,9 @@ def map_segments(
     if options.find_planes:
         noise = begin(partial(landmark_noise, scene, options.structure))
         scene = stages.run(find_planes, scene)
-        surface = surface_noise_px(scene, options.structure, noise())
-        weighted = dataclasses.replace(weighted, structure_sigma_px=surface)
-    observations = {name: getattr(shared(), name) for name in ("point_observations", "line_observations")}
-    scene = scene.replace(**observations)
+        weighted = dataclasses.replace(weighted, structure_sigma_px=surface_noise_px(scene, options.structure, noise()))
+    weights = shared()
+    scene = scene.replace(point_observations=weights.point_observations, line_observations=weights.line_observations)
     adjusted = stages.run(adjust_everything, scene, weighted)
     return result_of(points, scene, adjusted, weighted, line_map, options.min_confidence, not options.refine_poses)
 
