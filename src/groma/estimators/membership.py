@@ -19,11 +19,13 @@ All axes count: a feature that is uncertain along one, as a short line is in dep
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.association import MAX_SQUARE, maximise_shares
+from groma.execution import map_in_threads
 from groma.gates import chi_square_gate, gate
 
 
@@ -87,25 +89,28 @@ def memberships(found: Candidates, most: FloatArray) -> Membership:
     if len(found.owner) == 0:
         return Membership(np.zeros(0), np.zeros(num))
     shrink = np.concatenate([[0.0], np.geomspace(MEMBERSHIPS.least, 1.0, MEMBERSHIPS.tried)])
-    likelihood, shares = np.zeros((len(shrink), num)), []
-    groups = int(found.group.max()) + 1
-    for k, part in enumerate(shrink):
-        density = _density(found, part * most[found.owner])
-        share = maximise_shares(
-            density[rows], found.clutter[rows], found.group[rows], groups, MEMBERSHIPS.pooled, MEMBERSHIPS.rounds
-        )  # fmt: skip
-        shares.append(share)
-        mixed = share[found.group] * density + (1.0 - share[found.group]) * found.clutter
-        likelihood[k] = np.bincount(found.owner[rows], np.log(mixed[rows]), num)
+    tried = map_in_threads(partial(_tried, found, rows, most), shrink.tolist())
+    likelihood, shares = (np.array(part) for part in zip(*tried, strict=True))
     best = likelihood.argmax(axis=0)
     gain = likelihood.max(axis=0) - likelihood[0]
     # Where the widest fits best nothing stands out from clutter, whatever it is.
     best[(gain < 0.5 * chi_square_gate(MEMBERSHIPS.significance, 1)) | (best == len(shrink) - 1)] = 0
     deviation = shrink[best] * most
     density = _density(found, deviation[found.owner])
-    share = np.array(shares)[best[found.owner], found.group]
+    share = shares[best[found.owner], found.group]
     member = share * density
     return Membership(member / (member + (1.0 - share) * found.clutter), deviation)
+
+
+def _tried(found: Candidates, rows: IntArray, most: FloatArray, part: float) -> tuple[FloatArray, FloatArray]:
+    """Log likelihoods (K,) and shares of members by group where these deviate by a part of the most; ``rows`` count."""
+    density = _density(found, part * most[found.owner])
+    share = maximise_shares(
+        density[rows], found.clutter[rows], found.group[rows], int(found.group.max()) + 1, MEMBERSHIPS.pooled,
+        MEMBERSHIPS.rounds,
+    )  # fmt: skip
+    mixed = share[found.group[rows]] * density[rows] + (1.0 - share[found.group[rows]]) * found.clutter[rows]
+    return np.bincount(found.owner[rows], np.log(mixed), len(most)).astype(np.float64, copy=False), share
 
 
 def _density(found: Candidates, deviation: FloatArray) -> FloatArray:
