@@ -27,7 +27,7 @@ from groma.geometry import quaternion
 from groma.scene.pose_graph import PoseGraph
 
 if TYPE_CHECKING:
-    from scipy.sparse import csc_matrix
+    from scipy.sparse import csc_array
 
 
 def linear_start(graph: PoseGraph, held: BoolArray) -> PoseGraph | None:
@@ -65,9 +65,9 @@ def linear_start(graph: PoseGraph, held: BoolArray) -> PoseGraph | None:
     return graph.replace(poses=graph.poses.replace(world_from_body=np.where(free[:, None], new, poses)))
 
 
-def _rows(ends: tuple[IntArray, IntArray], blocks: tuple[FloatArray, FloatArray], count: int) -> csc_matrix:
+def _rows(ends: tuple[IntArray, IntArray], blocks: tuple[FloatArray, FloatArray], count: int) -> csc_array:
     """Return the matrix with one row of blocks (E, n, n) for each motion, at the columns of its two poses."""
-    from scipy.sparse import coo_matrix
+    from scipy.sparse import coo_array
 
     size = blocks[0].shape[1]
     inside = np.arange(size)
@@ -75,10 +75,10 @@ def _rows(ends: tuple[IntArray, IntArray], blocks: tuple[FloatArray, FloatArray]
     columns = [end[:, None, None] * size + inside + np.zeros_like(inside)[:, None] for end in ends]
     values = np.concatenate([np.broadcast_to(block, row.shape).ravel() for block in blocks])
     places = np.tile(row.ravel(), 2), np.concatenate([column.ravel() for column in columns])
-    return coo_matrix((values, places), shape=(row.size // size, count * size)).tocsc()
+    return coo_array((values, places), shape=(row.size // size, count * size)).tocsc()
 
 
-def _solved(matrix: csc_matrix, wanted: FloatArray, known: FloatArray, free: BoolArray) -> FloatArray:
+def _solved(matrix: csc_array, wanted: FloatArray, known: FloatArray, free: BoolArray) -> FloatArray:
     """Return the unknowns (N, 3) for which the matrix gives nearly what is wanted; those not free stay as known."""
     from scipy.sparse.linalg import splu
 
