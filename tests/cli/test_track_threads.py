@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""``groma track`` leaves OpenCV one thread where its own are at work; pairs of images keep those of dense disparities."""
+"""``groma track`` leaves OpenCV one thread where its own are at work; pairs of images keep those of disparities."""
 
 from types import SimpleNamespace
 
