@@ -45,6 +45,33 @@ def test_they_are_converted(here, capsys):
     assert read_scene("out").num_images == 5
 
 
+def test_images_that_are_missing_beside_others_are_said(here, capsys):
+    names = read_scene("nerf").images.names
+    assert run(["convert", "nerf", "none.npz"]) == 0
+    assert capsys.readouterr().err == ""  # a model alone
+    for name in names[:3]:
+        (Path("nerf") / name).parent.mkdir(parents=True, exist_ok=True)
+        (Path("nerf") / name).write_bytes(b"")
+    assert run(["convert", "nerf", "some", "--json", "r.json"]) == 0
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "2 of the 5 images" in said and names[3] in said and names[2] not in said
+    assert json.loads(Path("r.json").read_text())["warnings"][0] in said
+    for name in names[3:]:
+        (Path("nerf") / name).write_bytes(b"")
+    assert run(["convert", "nerf", "all.npz"]) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_a_model_without_image_sizes_is_said(here, capsys):
+    """Bundler's files have none; with the photographs beside them they are known."""
+    lens, pose = "500 0 0\n", "1 0 0\n0 1 0\n0 0 1\n0 0 0\n"
+    Path("bundle.out").write_text("# Bundle file v0.3\n2 0\n" + 2 * (lens + pose))
+    assert run(["convert", "bundle.out", "sized.npz"]) == 0
+    assert capsys.readouterr().err == ""
+    assert run(["convert", "bundle.out", "model"]) == 0
+    assert "2 cameras have no known size" in capsys.readouterr().err
+
+
 def test_poses_alone_are_no_model_for_a_map(here, capsys):
     Path("images").mkdir()
     assert run(["map", "images", "--model", "nerf", "-o", "out"]) == 1

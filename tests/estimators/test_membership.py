@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from groma.estimators.membership import Candidates, memberships
+from groma.estimators.membership import Candidates, averaged_memberships, memberships
 
 HALF = 1.0
 
@@ -41,6 +41,28 @@ def test_deviation_and_probability_are_those_of_the_mixture(axes, deviation):
         rows = (told.probability >= low) & (told.probability <= high)
         spread = np.sqrt((told.probability[rows] * (1.0 - told.probability[rows])).sum())
         assert abs(told.probability[rows].sum() - member[rows].sum()) < 4.0 * spread + 0.06 * rows.sum()  # steps
+
+
+@pytest.mark.parametrize("deviation", [0.0, 0.1, 0.19])
+def test_averaged_over_deviations_probabilities_are_those_of_the_mixture(deviation):
+    """Also where members deviate almost as far as they may, which the most likely deviation takes for clutter."""
+    rng = np.random.default_rng(8)
+    offset, variance, unit, member = mixed(rng, deviation, 1)
+    unit[:] = 1.0
+    offset[member, 0] = rng.normal(0.0, np.hypot(np.sqrt(variance[member, 0]), deviation))
+    found, most = candidates(offset, variance, unit), np.array([0.2])
+    told = averaged_memberships(found, most, np.ones(1))
+    assert told.deviation[0] == pytest.approx(deviation, rel=0.3, abs=0.02)
+    spread = np.sqrt((told.probability * (1.0 - told.probability)).sum())
+    assert abs(told.probability.sum() - member.sum()) < 4.0 * spread + 0.06 * len(member)
+    # What tells nothing of the deviation leaves it anywhere up to the largest one.
+    unknown = averaged_memberships(found, most, np.zeros(1)).deviation[0]
+    assert 0.04 < unknown < 0.16
+
+
+def test_averages_of_nothing():
+    told = averaged_memberships(candidates(np.zeros((0, 1)), np.zeros((0, 1)), np.zeros(0)), np.ones(2), np.ones(2))
+    assert len(told.probability) == 0 and told.deviation.tolist() == [0.0, 0.0]
 
 
 def test_an_uncertain_axis_does_not_hide_a_certain_one():

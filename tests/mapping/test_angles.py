@@ -118,6 +118,16 @@ def test_how_right_angles_are_is_estimated():
     assert exact.sigma.max() / np.sqrt(11 / 2) < 3e-4
 
 
+def test_walls_that_deviate_by_almost_half_a_degree_keep_their_relations():
+    """Whether one of ten walls stands a little more askew does not decide about the 45 pairs of them."""
+    number, walls = [], np.array([X, Y])[[0] * 5 + [1] * 5]
+    for seed in range(20):
+        rng = np.random.default_rng(300 + seed)
+        off = np.abs(rng.normal(0.0, np.deg2rad(0.4), len(walls)))
+        number.append(len(found(aside(walls, off, rng), seed, 1e-4).pairs))
+    assert min(number) > 0.9 * 45
+
+
 def test_uncertain_vectors_and_few_say_nothing():
     assert len(found(np.array([X, X, Y, Y, Z, Z]), sigma=0.02).pairs) == 0
     assert len(found(np.zeros((0, 3))).pairs) == 0 and len(found(X[None]).pairs) == 0

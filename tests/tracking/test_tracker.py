@@ -323,3 +323,15 @@ def test_a_track_without_frames():
     assert len(result.trajectory) == 0
     assert result.scene.num_images == 0
     assert "No map" in result.warnings[-1]
+
+
+@pytest.mark.parametrize("kind", ["rgbd", "stereo"])
+def test_a_camera_at_rest_has_the_map_of_its_one_view(truth, kind):
+    """Half a pixel of disparity at 2.5 units is 0.1 units, and depth is better; the first frame is the world."""
+    frames = _room.frames(kind, np.repeat(truth[:1], 4, axis=0))
+    _, result = _run(frames, _room.camera(_room.BASELINE) if kind == "stereo" else None)
+    assert len(result.keyframes) == 1
+    assert result.statistics["points"] == result.scene.num_points > 50
+    assert any("one keyframe" in sentence for sentence in result.warnings)
+    off_walls = np.abs(_room.ROOM - np.abs(result.scene.points.xyz)).min(axis=1)
+    assert np.median(off_walls) < 0.1

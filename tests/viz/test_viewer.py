@@ -357,3 +357,5 @@ def test_photographs_are_found_by_what_lies_beside_a_model(tmp_path):
         assert folder_of_images(model, names) == beside
     assert folder_of_images(model, ["../secret.jpg"]) is None
     assert folder_of_images(tmp_path / "project" / "scene.npz", names) == beside
+    for place in (beside, beside / "transforms.json"):  # names as paths from the folder of the file
+        assert folder_of_images(place, names) == beside

@@ -19,11 +19,13 @@ All axes count: a feature that is uncertain along one, as a short line is in dep
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.association import MAX_SQUARE, maximise_shares
+from groma.execution import map_in_threads
 from groma.gates import chi_square_gate, gate
 
 
@@ -83,29 +85,73 @@ def memberships(found: Candidates, most: FloatArray) -> Membership:
     most : (K,) float64
         Largest deviation that members of each structure may have; deviations down to a fiftieth are tried.
     """
-    num, rows = len(most), np.flatnonzero(found.counted)
+    num = len(most)
     if len(found.owner) == 0:
         return Membership(np.zeros(0), np.zeros(num))
-    shrink = np.concatenate([[0.0], np.geomspace(MEMBERSHIPS.least, 1.0, MEMBERSHIPS.tried)])
-    likelihood, shares = np.zeros((len(shrink), num)), []
-    groups = int(found.group.max()) + 1
-    for k, part in enumerate(shrink):
-        density = _density(found, part * most[found.owner])
-        share = maximise_shares(
-            density[rows], found.clutter[rows], found.group[rows], groups, MEMBERSHIPS.pooled, MEMBERSHIPS.rounds
-        )  # fmt: skip
-        shares.append(share)
-        mixed = share[found.group] * density + (1.0 - share[found.group]) * found.clutter
-        likelihood[k] = np.bincount(found.owner[rows], np.log(mixed[rows]), num)
+    tried, likelihood, shares = _tried(found, most)
     best = likelihood.argmax(axis=0)
     gain = likelihood.max(axis=0) - likelihood[0]
     # Where the widest fits best nothing stands out from clutter, whatever it is.
-    best[(gain < 0.5 * chi_square_gate(MEMBERSHIPS.significance, 1)) | (best == len(shrink) - 1)] = 0
-    deviation = shrink[best] * most
-    density = _density(found, deviation[found.owner])
-    share = np.array(shares)[best[found.owner], found.group]
-    member = share * density
-    return Membership(member / (member + (1.0 - share) * found.clutter), deviation)
+    best[(gain < 0.5 * chi_square_gate(MEMBERSHIPS.significance, 1)) | (best == len(tried) - 1)] = 0
+    deviation = tried[best, np.arange(num)]
+    share = shares[best[found.owner], found.group]
+    return Membership(_probability(found, deviation, share), deviation)
+
+
+def averaged_memberships(found: Candidates, most: FloatArray, worth: FloatArray) -> Membership:
+    """The same, averaged over all deviations that are tried, each as likely as it is by the features.
+
+    Which deviation is the most likely one can hang on a single feature; an average does not. None is preferred: the
+    logarithm of the deviation has the same prior everywhere up to the largest one.
+
+    Parameters
+    ----------
+    found, most
+        As :func:`memberships` has them.
+    worth : (K,) float64
+        What a feature of each structure tells of the deviation, as a share of an independent one.
+
+    Returns
+    -------
+    Membership
+        With the root mean square deviation of the members of each structure.
+    """
+    if len(found.owner) == 0:
+        return Membership(np.zeros(0), np.zeros(len(most)))
+    tried, likelihood, shares = _tried(found, most)
+    weight = np.exp(worth * (likelihood - likelihood.max(axis=0)))
+    weight /= weight.sum(axis=0)
+    probability, square, members = np.zeros(len(found.owner)), np.zeros(len(most)), np.zeros(len(most))
+    for deviation, share, part in zip(tried, shares, weight, strict=True):
+        member = part[found.owner] * _probability(found, deviation, share[found.group])
+        probability += member
+        number = np.bincount(found.owner[found.counted], member[found.counted], len(most))
+        square, members = square + number * deviation**2, members + number
+    return Membership(probability, np.sqrt(square / np.maximum(members, np.finfo(float).tiny)))
+
+
+def _tried(found: Candidates, most: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Deviations (T, K), the logarithms of their likelihoods (T, K), and the shares of members (T, G) with them."""
+    tried = np.concatenate([[0.0], np.geomspace(MEMBERSHIPS.least, 1.0, MEMBERSHIPS.tried)])[:, None] * most
+    fits = map_in_threads(partial(_fit, found, np.flatnonzero(found.counted)), list(tried))
+    likelihood, shares = (np.array(part) for part in zip(*fits, strict=True))
+    return tried, likelihood, shares
+
+
+def _fit(found: Candidates, rows: IntArray, deviation: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Log likelihoods (K,) and shares of members (G,) with deviations (K,), by the pairs in ``rows``."""
+    density, group = _density(found, deviation[found.owner])[rows], found.group[rows]
+    share = maximise_shares(
+        density, found.clutter[rows], group, int(found.group.max()) + 1, MEMBERSHIPS.pooled, MEMBERSHIPS.rounds
+    )
+    mixed = share[group] * density + (1.0 - share[group]) * found.clutter[rows]
+    return np.bincount(found.owner[rows], np.log(mixed), len(deviation)).astype(np.float64, copy=False), share
+
+
+def _probability(found: Candidates, deviation: FloatArray, share: FloatArray) -> FloatArray:
+    """Probability (N,) that pairs are one, by the deviations (K,) of the structures and the share (N,) of members."""
+    member = share * _density(found, deviation[found.owner])
+    return member / (member + (1.0 - share) * found.clutter)
 
 
 def _density(found: Candidates, deviation: FloatArray) -> FloatArray:

@@ -15,7 +15,7 @@ from groma.tracking.map.map_scene import SeenLines, SeenPlanes, SeenPoints, map_
 from groma.tracking.map.relations import find_relations
 from groma.tracking.map.track_map import TrackMap
 
-#: Points seen in fewer keyframes do not go into the scene.
+#: Points seen in fewer keyframes do not go into the scene; where the camera stood still, there is but one.
 MIN_VIEWS = 2
 
 
@@ -31,7 +31,7 @@ def map_to_scene(track_map: TrackMap, camera: TrackCamera, relations: bool = Tru
     relations
         Whether landmarks that belong together were tied.
     min_views
-        Points seen in fewer keyframes are left out.
+        Points seen in fewer keyframes are left out, if there are as many keyframes.
     """
     living = track_map.living()
     cameras = Cameras(
@@ -50,7 +50,7 @@ def map_to_scene(track_map: TrackMap, camera: TrackCamera, relations: bool = Tru
         for kind in ("points", "lines", "planes")
     }
     points = PointMeasurements.stack([m.points for m in measured])
-    often = np.bincount(points.index, minlength=len(track_map.points)) >= min_views
+    often = np.bincount(points.index, minlength=len(track_map.points)) >= min(min_views, len(living))
     keep = often[points.index]
     points = points.take(keep)
     lines = LineMeasurements.stack([m.lines for m in measured])
@@ -68,3 +68,10 @@ def map_to_scene(track_map: TrackMap, camera: TrackCamera, relations: bool = Tru
         SeenPlanes(plane_ids, replace(planes, index=np.searchsorted(plane_ids, planes.index)), image["planes"]),
         relations=find_relations(track_map, point_ids, line_ids, plane_ids) if relations else Relations(),
     )
+
+
+def about_rest(scene: Scene) -> list[str]:
+    """Say so where a map has one keyframe, whose measurements nothing confirms."""
+    if scene.num_images != 1:
+        return []
+    return ["The map has one keyframe, because the camera hardly moved: landmarks are where that view alone has them."]

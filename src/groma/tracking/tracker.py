@@ -55,7 +55,7 @@ from groma.tracking.pose.initialise import Initialiser
 from groma.tracking.pose.prediction import MotionModel
 from groma.tracking.pose.relocalise import Found, promote
 from groma.tracking.pose.verification import PoseVerification
-from groma.tracking.result import map_to_scene
+from groma.tracking.result import about_rest, map_to_scene
 from groma.tracking.stopwatch import Stopwatch
 
 
@@ -381,7 +381,7 @@ class Tracker:
         warnings = [*self._checks.warnings, *ending.warnings]
         if not history.entries:
             warnings.append("No map was made: no frame could be used, or the camera did not move enough to start.")
-        warnings += about_submaps(self._breaks, where, [count[root] for root in others])
+        warnings += about_rest(whole.scene) + about_submaps(self._breaks, where, [count[root] for root in others])
         return TrackResult(whole.trajectory, whole.scene, whole.keyframes, statistics, tuple(warnings), tuple(submaps))
 
     def statistics(self) -> dict:

@@ -42,12 +42,13 @@ def folder_of_images(model: str | os.PathLike[str], names: Iterable[str]) -> Pat
     ----------
     model : path
         A folder or file of a model. Folders that are tried: the one that ``summary.json`` in it names, as ``groma map``
-        writes it; then ``images`` in the model, beside it, and one and two folders higher, as in COLMAP's projects.
+        writes it; then ``images`` in the model, beside it, and one and two folders higher, as in COLMAP's projects;
+        then the folder itself or that of the file, from which ``transforms.json`` names its images.
     names : iterable of str
         Names of the images; the folder holds one of the first hundred at least.
     """
     place, wanted = Path(model).absolute(), [name for name, _ in zip(names, range(100), strict=False)]
-    tried = [parent / "images" for parent in (place, *place.parents[:3])]
+    tried = [*(parent / "images" for parent in (place, *place.parents[:3])), place, place.parent]
     try:
         numbers = json.loads(read_text(place / "summary.json"))
         if isinstance(numbers, dict) and isinstance(numbers.get("images"), str):

@@ -2,7 +2,7 @@
 """``groma convert``: from one file format to another."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,6 +12,9 @@ from groma.cli.shared.console import Console
 from groma.cli.shared.input import check_inputs
 from groma.cli.shared.parts import is_parts
 from groma.errors import InputError
+
+if TYPE_CHECKING:
+    from groma.scene import Scene
 
 
 def convert(
@@ -63,8 +66,42 @@ def _convert(source: Path, target: Path, console: Console, force: bool) -> dict[
         scene = convert_scene(source, target, force)
     if target.suffix.lower() == ".json":  # cameras, poses and points
         scene = scene.points_only().keep(point_observations=[])
-    console.wrote(f"{target}: {sentence_of(scene, geometry=target.suffix.lower() in ('.ply', '.obj', '.dxf'))}")
-    return counts_of(scene)
+    geometry = target.suffix.lower() in (".ply", ".obj", ".dxf")
+    console.wrote(f"{target}: {sentence_of(scene, geometry=geometry)}")
+    warnings = [] if geometry else [*_missing_images(source, scene), *_unknown_sizes(scene, target)]
+    for sentence in warnings:
+        console.warn(sentence)
+    return {**counts_of(scene), "warnings": warnings}
+
+
+def _missing_images(source: Path, scene: "Scene") -> list[str]:
+    """Say which images are not there, where others of the scene lie beside it."""
+    from groma._counted import first_of
+    from groma.viz.pictures import folder_of_images, image_file
+
+    names = scene.images.names
+    folder = folder_of_images(source, names)
+    missing = [] if folder is None else [name for name in names if image_file(folder, name) is None]
+    if not missing:
+        return []
+    return [
+        f"{len(missing):,} of the {len(names):,} images are not in {folder}: {first_of(missing, 3)}. Their poses are "
+        "written all the same, and programs that read the images may stop there."
+    ]
+
+
+def _unknown_sizes(scene: "Scene", target: Path) -> list[str]:
+    """Say that a model of COLMAP, which has a place for the sizes of images, is written without."""
+    from groma._counted import counted
+
+    cameras = scene.cameras
+    unknown = int(((cameras.width == 0) | (cameras.height == 0)).sum())
+    if target.suffix or not unknown:
+        return []
+    return [
+        f"The images of {counted(unknown, 'cameras')} have no known size: the model says 0 x 0 pixels, counted from "
+        "the image centre. groma adjust takes it; for anything else put the photographs beside the input, and repeat."
+    ]
 
 
 def _cut(source: Path, target: Path, console: Console, force: bool, part_size: int | None) -> dict[str, Any]:

@@ -13,12 +13,13 @@ where one place in space explains a mean square distance of more than the width 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from groma._typing import BoolArray, FloatArray
+from groma._typing import BoolArray
 from groma.estimators.line_intervals import supported_intervals
-from groma.execution import beside
+from groma.execution import begin
 from groma.gates import gate
 from groma.geometry import segment2
 from groma.geometry.algebra import ratio
@@ -49,10 +50,9 @@ def with_supported_intervals(scene: Scene) -> Scene:
     Lines that no two images support anywhere stay as they are.
     """
     seen = scene.line_observations
-    shares: list[FloatArray] = []
-    with beside(lambda: shares.append(observed_shares(scene))):
-        leaves = _beside_edges(scene)
-    share, length = shares[0], segment2.length(seen.segment)
+    shares = begin(partial(observed_shares, scene))
+    leaves = _beside_edges(scene)
+    share, length = shares(), segment2.length(seen.segment)
     size = np.maximum(share[:, 1] - share[:, 0], 1e-12) / np.maximum(length, 1e-12)
     known, bent = np.isfinite(share.sum(axis=1)), np.asarray(leaves.any(axis=1))[seen.line_idx]
     whole, cut = np.flatnonzero(known & ~bent), np.flatnonzero(known & bent)

@@ -6,9 +6,11 @@ together. At a right angle :math:`x = u \cdot v` is normal, with :math:`u^\top\S
 parallel vectors the two components of v across u are, with :math:`B(\Sigma_u + \Sigma_v)B^\top`.
 
 Angles that are meant to be right deviate by t beyond that noise; of the others one half is nearly right, with a normal
-deviation of two degrees, and the other half is spread evenly. For each kind of pair, t and the share of those that are
-right are estimated together (:mod:`groma.estimators.membership`). An angle that is surely a little off is therefore no
-right one, and t has a bound: a house whose angles are all a degree off has no right angles, and none is forced on it.
+deviation of two degrees, and the other half is spread evenly. For each kind of pair, the share of those that are
+right is estimated for every t up to a bound, and what follows is averaged over t, each as likely as the pairs make it
+(:mod:`groma.estimators.membership`). An angle that is surely a little off is therefore no right one, and a house whose
+angles are all a degree off has no right angles, and none is forced on it. As pairs of the same vectors are not
+independent, they tell of t as much as the vectors do that they are of.
 
 Many pairs are tried, so they are kept, the surest first, only as long as the expected share of wrong ones among them,
 the mean of :math:`1 - P`, stays small: the false discovery rate.
@@ -26,7 +28,7 @@ import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.directions import DirectionSet
-from groma.estimators.membership import Candidates, memberships
+from groma.estimators.membership import Candidates, averaged_memberships
 from groma.estimators.plane_search import PlaneSet
 from groma.gates import chi_square_gate, gate
 from groma.geometry.algebra import perpendicular
@@ -143,7 +145,7 @@ def right_angles(
     exact = variance + gates.exact**2 * live
     family = 2 * kind[found].sum(axis=1) + right
     even = np.where(right, 0.5 / gates.layer, 1.0 / (np.pi * gates.layer**2))
-    told = memberships(
+    told = averaged_memberships(
         Candidates(
             owner=family,
             offset=offset,
@@ -154,6 +156,7 @@ def right_angles(
             group=family,
         ),
         np.full(6, gates.most),
+        _worth(found[certain], family[certain], len(vectors)),
     )
     squared = (offset**2 / (exact + (told.deviation[family, None] * live) ** 2)).sum(axis=1)
     passed = certain & (squared < np.where(right, *(chi_square_gate(1.0 - level, freedom) for freedom in (1, 2))))
@@ -168,6 +171,15 @@ def right_angles(
         deviation[k] = _upper_end(offset[rows][axes[rows]] ** 2, variance[rows][axes[rows]], per_vector, gates)
     sigma = deviation[family[kept]] * np.sqrt(np.maximum(0.25 * times[found[kept]].sum(axis=1), 1.0))
     return Angles(found[kept], right[kept], told.probability[kept], sigma)
+
+
+def _worth(pairs: IntArray, family: IntArray, num: int) -> FloatArray:
+    """(6,) vectors per pair of each kind, at most one: pairs of the same vectors tell the same."""
+    worth = np.ones(6)
+    for k in np.unique(family):
+        rows = family == k
+        worth[k] = min(np.count_nonzero(np.bincount(pairs[rows].ravel(), minlength=num)) / rows.sum(), 1.0)
+    return worth
 
 
 def _normal(offset: FloatArray, variance: FloatArray) -> FloatArray:
