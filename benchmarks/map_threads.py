@@ -54,9 +54,10 @@ def run(images, model, threads):
         with loading("map", threads):
             result = map_images(images, Path(folder) / "work", scene, MapOptions(threads=threads), mark)
         mark("diagnosis and uncertainty")
+        photographs = result.photographs(images)
         summary = result.summary(result.diagnose())
         mark("writing, report")
-        result.write(Path(folder) / "map", images=images, summary=summary)
+        result.write(Path(folder) / "map", images=images, summary=summary, photographs=photographs)
     mark("end")
     from groma.mapping.checkpoints import digest
 

@@ -26,6 +26,7 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, TypeVar
 
 _Item = TypeVar("_Item")
@@ -194,6 +195,21 @@ def map_work(
     return results
 
 
+def map_largest_first(
+    function: Callable[[_Item], _Result],
+    items: Sequence[_Item],
+    sizes: Sequence[float],
+    progress: Callable[[int, int], None] | None = None,
+) -> list[_Result]:
+    """Do what :func:`map_work` does, the largest items first: at the end all workers then wait for a small one.
+
+    ``sizes`` are about in proportion to the time that the items take.
+    """
+    order = sorted(range(len(items)), key=lambda place: -sizes[place])
+    found = map_work(function, [items[place] for place in order], progress)
+    return [result for _, result in sorted(zip(order, found, strict=True), key=lambda pair: pair[0])]
+
+
 def map_in_threads(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_Result]:
     """Do what :func:`map_work` does in threads of this process.
 
@@ -211,11 +227,34 @@ def together(*functions: Callable[[], Any]) -> tuple[Any, ...]:
     return tuple(map_in_threads(_called, functions))
 
 
+def begin(function: Callable[[], _Result]) -> Callable[[], _Result]:
+    """Begin something in a thread of this process whose result is asked for later; return what gives it.
+
+    What no thread has begun by then is done by who asks, and so is everything without workers. It must change nothing:
+    where what goes on meanwhile fails, nobody waits for it.
+
+    Examples
+    --------
+    >>> from groma.execution import begin, work_with
+    >>> with work_with(2):
+    ...     total = begin(lambda: sum(range(10)))
+    ...     total()
+    45
+    """
+    crew = _CREW.get()
+    executor = None if crew is None else crew.here.executor
+    if executor is None:
+        return cache(function)
+    future = executor.submit(function)
+    return cache(lambda: function() if future.cancel() else future.result())
+
+
 @contextmanager
 def beside(function: Callable[[], object]) -> Iterator[None]:
     """Call a function in a thread of this process while the block goes on; without workers, when it has ended.
 
-    What it raises is raised at the end of the block, unless the block itself has raised.
+    Unlike what :func:`begin` begins, it may write: the block does not end before it. What it raises is raised at the
+    end of the block, unless the block itself has raised.
     """
     crew = _CREW.get()
     executor = None if crew is None else crew.here.executor

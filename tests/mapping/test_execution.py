@@ -19,7 +19,16 @@ import numpy as np
 import pytest
 from _wireframe import arc, random_lines, wireframe
 
-from groma.execution import available_cores, beside, map_ranges, map_work, num_workers, work_with
+from groma.execution import (
+    available_cores,
+    begin,
+    beside,
+    map_largest_first,
+    map_ranges,
+    map_work,
+    num_workers,
+    work_with,
+)
 from groma.mapping.lines.build import MapLinesOptions, map_lines
 
 
@@ -84,6 +93,47 @@ def test_what_is_done_beside_a_block_goes_on_in_a_thread_and_is_done_when_it_end
             with pytest.raises(KeyError, match="block"), beside(lambda: done.append("never lost") or 1 // 0):
                 raise KeyError("block")
     assert done.count("block") == 2
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_the_largest_are_done_first_and_results_keep_their_order(workers):
+    started, said = [], []
+
+    def work(item):
+        started.append(item)
+        return 10 * item
+
+    with work_with(workers):
+        found = map_largest_first(work, range(5), [3, 1, 4, 1, 5], lambda done, total: said.append((done, total)))
+    assert found == [0, 10, 20, 30, 40]
+    assert sorted(started[:2]) == [2, 4] and sorted(started) == [0, 1, 2, 3, 4]
+    assert said == [(done, 5) for done in range(6)]
+
+
+def test_what_was_begun_goes_on_in_a_thread_and_is_done_once():
+    met, calls = threading.Barrier(2, timeout=30.0), []
+    with work_with(2):
+        ask = begin(lambda: (met.wait(), calls.append("beside"), 7)[-1])
+        met.wait()  # neither gets past it without the other
+        assert (ask(), ask()) == (7, 7)
+    with work_with(1):
+        ask = begin(lambda: calls.append("asked") or 8)
+        assert calls == ["beside"]
+        assert (ask(), ask()) == (8, 8)
+    assert calls == ["beside", "asked"]
+    for workers in (1, 2):
+        with work_with(workers), pytest.raises(ZeroDivisionError):
+            begin(lambda: 1 // 0)()
+
+
+def test_what_no_thread_has_begun_is_done_by_who_asks():
+    free, place = threading.Event(), []
+    with work_with(2):
+        busy = [begin(free.wait) for _ in range(2)]
+        begin(lambda: place.append(threading.current_thread()))()
+        free.set()
+        assert [ask() for ask in busy] == [True, True]
+    assert place == [threading.current_thread()]
 
 
 def test_workers_are_those_given_outermost_and_none_inside_a_worker():

@@ -206,7 +206,7 @@ def test_photographs_keep_to_their_budget(tmp_path):
     noise = np.random.default_rng(0).integers(0, 255, (900, 1200, 3), np.uint8)
     cv2.imwrite(str(tmp_path / "first.jpg"), noise)
     cv2.imwrite(str(tmp_path / "second.jpg"), noise)
-    photos = _page_images._photographs(["first.jpg", "missing.jpg", "second.jpg"], tmp_path)
+    photos = _page_images._photographs(["first.jpg", "missing.jpg", "second.jpg"], tmp_path)()
     assert photos[1] == "" and all(photo.startswith("data:image/jpeg;base64,") for photo in photos[::2])
     assert all(len(jpeg_address(noise, budget)) <= 1.1 * budget for budget in (30_000, 100_000, 10_000_000))
 

@@ -19,11 +19,13 @@ All axes count: a feature that is uncertain along one, as a short line is in dep
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.association import MAX_SQUARE, maximise_shares
+from groma.execution import map_in_threads
 from groma.gates import chi_square_gate, gate
 
 
@@ -130,18 +132,20 @@ def averaged_memberships(found: Candidates, most: FloatArray, worth: FloatArray)
 
 def _tried(found: Candidates, most: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Deviations (T, K), the logarithms of their likelihoods (T, K), and the shares of members (T, G) with them."""
-    rows, groups = np.flatnonzero(found.counted), int(found.group.max()) + 1
     tried = np.concatenate([[0.0], np.geomspace(MEMBERSHIPS.least, 1.0, MEMBERSHIPS.tried)])[:, None] * most
-    likelihood, shares = np.zeros(tried.shape), np.zeros((len(tried), groups))
-    for k, deviation in enumerate(tried):
-        density = _density(found, deviation[found.owner])
-        shares[k] = maximise_shares(
-            density[rows], found.clutter[rows], found.group[rows], groups, MEMBERSHIPS.pooled, MEMBERSHIPS.rounds
-        )  # fmt: skip
-        share = shares[k, found.group]
-        mixed = share * density + (1.0 - share) * found.clutter
-        likelihood[k] = np.bincount(found.owner[rows], np.log(mixed[rows]), len(most))
+    fits = map_in_threads(partial(_fit, found, np.flatnonzero(found.counted)), list(tried))
+    likelihood, shares = (np.array(part) for part in zip(*fits, strict=True))
     return tried, likelihood, shares
+
+
+def _fit(found: Candidates, rows: IntArray, deviation: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Log likelihoods (K,) and shares of members (G,) with deviations (K,), by the pairs in ``rows``."""
+    density, group = _density(found, deviation[found.owner])[rows], found.group[rows]
+    share = maximise_shares(
+        density, found.clutter[rows], group, int(found.group.max()) + 1, MEMBERSHIPS.pooled, MEMBERSHIPS.rounds
+    )
+    mixed = share[group] * density + (1.0 - share[group]) * found.clutter[rows]
+    return np.bincount(found.owner[rows], np.log(mixed), len(deviation)).astype(np.float64, copy=False), share
 
 
 def _probability(found: Candidates, deviation: FloatArray, share: FloatArray) -> FloatArray:

@@ -32,7 +32,7 @@ from groma._version import __version__
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult
 from groma.adjustment.survey.given import Survey
-from groma.execution import together, work_with
+from groma.execution import begin, work_with
 from groma.features.contract import ImageRetrieval, SegmentDetector, SegmentMatcher
 from groma.features.external import ExternalMatches
 from groma.features.matches import LineMatches
@@ -60,7 +60,7 @@ from groma.mapping.refine_points import PointRefinementOptions, refine_points
 from groma.mapping.result import SCENES_OF_RESULT, MapResult, result_of
 from groma.mapping.start import start_of
 from groma.mapping.structure.find import StructureOptions, find_structure
-from groma.mapping.structure.flatness import surface_noise_px
+from groma.mapping.structure.flatness import landmark_noise, surface_noise_px
 from groma.mapping.surveyed import adjust_with_survey, tied
 from groma.mapping.with_depths import find_segment_depths, with_depths
 from groma.scene import Scene
@@ -277,9 +277,10 @@ def map_segments(
         # The lines as mapped are good starts, and only the adjusted ones tell the noise of the segments.
         weighted = _weighted(joint, options)
         earlier = EarlierMap(before, line_map)
+        moved = begin(partial(moved_px, before, joint, GATES.moved_share))
         line_map = stages.run(find_lines_again, joint, segments, matches, neighbors, earlier, tag=tag)
         scene = with_line_depths(line_map.add_to(joint, segments), line_map, segments, depths)
-        if scene.num_lines == 0 or moved_px(before, joint, GATES.moved_share) <= options.lines.noise:
+        if scene.num_lines == 0 or moved() <= options.lines.noise:
             break
     if scene.num_lines:
         factor, scale = 1.0, GATES.last_loss_scale
@@ -287,13 +288,13 @@ def map_segments(
             factor = min(line_bend(scene, weighted.line_end_correlation) / scale, 1.0)
         weighted = dataclasses.replace(weighted, loss="cauchy", loss_scale=scale, line_loss_factor=factor)
     sigma_px = weighted.point_sigma_px, weighted.line_sigma_px * math.sqrt(1.0 + weighted.line_end_correlation)
+    shared = begin(partial(with_shared_noise, scene, *sigma_px))
     if options.find_planes:
+        noise = begin(partial(landmark_noise, scene, options.structure))
         scene = stages.run(find_planes, scene)
-        of_planes = partial(surface_noise_px, scene, options.structure)
-        scene, surface = together(partial(with_shared_noise, scene, *sigma_px), of_planes)
-        weighted = dataclasses.replace(weighted, structure_sigma_px=surface)
-    else:
-        scene = with_shared_noise(scene, *sigma_px)
+        weighted = dataclasses.replace(weighted, structure_sigma_px=surface_noise_px(scene, options.structure, noise()))
+    weights = shared()
+    scene = scene.replace(point_observations=weights.point_observations, line_observations=weights.line_observations)
     adjusted = stages.run(adjust_everything, scene, weighted)
     return result_of(points, scene, adjusted, weighted, line_map, options.min_confidence, not options.refine_poses)
 

@@ -39,6 +39,7 @@ from groma.scene import Scene
 from groma.scene.counts import num_relations
 from groma.solver.observability.diagnosis import Diagnosis, Finding
 from groma.viz.pictures import ImageFiles
+from groma.viz.report.images import Photographs, page_photographs
 from groma.viz.report.page import PageContents, write_report
 from groma.viz.report.survey import survey_card
 from groma.viz.report.tables import contributions_card
@@ -130,6 +131,10 @@ class MapResult:
             numbers["survey"] = survey_numbers(self.surveyed, found, self.scene)
         return numbers
 
+    def photographs(self, images: ImageFiles | None) -> Photographs:
+        """Begin to read the photographs for the page of :meth:`write`; other work goes on meanwhile."""
+        return page_photographs(self.scene, images)
+
     def write(
         self,
         folder: str | os.PathLike[str],
@@ -139,6 +144,7 @@ class MapResult:
         summary: Mapping[str, Any] | None = None,
         force: bool = False,
         work: str | os.PathLike[str] | None = None,
+        photographs: Photographs | None = None,
     ) -> None:
         """Write everything that ``groma map`` writes to a folder, whole or not at all.
 
@@ -159,6 +165,8 @@ class MapResult:
             Replace what is there.
         work : path, optional
             Folder on the same disk in which the results are built; by default beside ``folder``.
+        photographs : callable, optional
+            What :meth:`photographs` began before; by default they are read now.
         """
         numbers = dict(self.summary() if summary is None else summary)
         if isinstance(images, str | os.PathLike):
@@ -167,11 +175,11 @@ class MapResult:
             others = draft.with_name("others")
             others.mkdir()
             with beside(partial(write_scene, self.scene, draft, format="colmap")):
-                self._write_others(others, images, title, numbers)
+                self._write_others(others, photographs or self.photographs(images), title, numbers)
             for file in others.iterdir():
                 file.rename(draft / file.name)
 
-    def _write_others(self, folder: Path, images: ImageFiles | None, title: str, numbers: dict[str, Any]) -> None:
+    def _write_others(self, folder: Path, photographs: Photographs, title: str, numbers: dict[str, Any]) -> None:
         """Write what is not part of the COLMAP model."""
         write_scene(self.scene, folder / "scene.npz")
         write_geometry(self.scene, folder)
@@ -180,14 +188,14 @@ class MapResult:
             self.before,
             self.scene,
             self.report,
-            images,
-            title,
-            PageContents(
+            title=title,
+            contents=PageContents(
                 self.outcomes,
                 self.explanation,
                 self.warnings,
                 numbers.get("diagnosis"),
                 contributions_card(numbers.get("contributions")) + survey_card(numbers.get("survey")),
+                photographs=photographs,
             ),
         )
         if "survey" in numbers:

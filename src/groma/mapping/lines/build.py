@@ -27,7 +27,7 @@ import numpy as np
 
 from groma._typing import IntArray
 from groma.errors import InputError
-from groma.execution import beside, work_with
+from groma.execution import begin, work_with
 from groma.mapping.lines.by_clusters import map_lines_by_clusters
 from groma.mapping.lines.collect import line_map_of
 from groma.mapping.lines.filtering.filters import Evidence, filtered
@@ -125,8 +125,8 @@ def map_lines(
         else:
             ratios = np.zeros((len(views.image_idx), 2))
         proposing, linking = partial(report, "proposing lines"), partial(report, "linking segments")
-        with beside(load_minimiser):
-            places = find_places(scene, views, ratios, compared, matches, options, proposing, known)
+        begin(load_minimiser)
+        places = find_places(scene, views, ratios, compared, matches, options, proposing, known)
         unmerged = grow(Tracks.none(views, places.rejection), places, compared, options, linking)
         evidence = Evidence(
             options=options,

@@ -28,7 +28,7 @@ from groma.adjustment.terms.relations import ANGLES, lengths_per_pixel
 from groma.errors import InputError
 from groma.estimators.directions import DirectionOptions, DirectionSet, directions_from_lines
 from groma.estimators.plane_search import PlaneOptions, PlaneSet, find_planes
-from groma.execution import beside, together
+from groma.execution import begin, together
 from groma.geometry.algebra import norm
 from groma.mapping.groups import num_distinct
 from groma.mapping.noise.landmarks import LineNoise, PointNoise, line_noise, point_noise
@@ -148,24 +148,20 @@ def detect_structure(
     report("finding planes", 0, 1)
     marks = _landmarks(scene, options)
     on_line = on_lines(marks, level, least)
-    told: list[tuple[tuple[DirectionSet, Pairs], Pairs]] = []
-
-    def of_lines_alone() -> None:
-        told.append((_parallels(scene, marks, options, candidates), meetings(marks, level, least_line)))
-
-    with beside(of_lines_alone):
-        planes = _planes_in(marks, on_line, options, partial(report, "finding planes"))
-        report("finding directions", 0, 1)
+    parallels = begin(partial(_parallels, scene, marks, options, candidates))
+    meeting = begin(partial(meetings, marks, level, least_line))
+    planes = _planes_in(marks, on_line, options, partial(report, "finding planes"))
+    report("finding directions", 0, 1)
+    directions, along = parallels()
+    found = {"lines_meeting": meeting()}
     report("finding what lies on what", 0, 1)
     enough = options.planes.min_support
     planes, point_on_plane, line_on_plane = on_fitted_planes(marks, planes, level, (least, least_line), enough)
-    (directions, along), meeting = told[0]
     support = point_on_plane.counts(len(planes)) + 2 * line_on_plane.counts(len(planes))
     planes, new = _only(planes, support >= (enough + 1) // 2)
-    found = {"point_on_plane": point_on_plane.renumbered(new), "line_on_plane": line_on_plane.renumbered(new)}
+    found |= {"point_on_plane": point_on_plane.renumbered(new), "line_on_plane": line_on_plane.renumbered(new)}
     found["line_along_direction"] = along
     found["point_on_line"] = on_line if options.points_on_lines else Pairs.none()
-    found["lines_meeting"] = meeting
     vertical = vertical_of(scene)
     found |= angles_between(planes, directions, vertical, level)
     return Structure(

@@ -20,7 +20,7 @@ import numpy as np
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.terms.relations import lengths_per_pixel
 from groma.mapping.noise.landmarks import GATES as LANDMARK_GATES
-from groma.mapping.noise.landmarks import line_noise, point_noise
+from groma.mapping.noise.landmarks import LineNoise, PointNoise, line_noise, point_noise
 from groma.mapping.structure.find import StructureOptions
 from groma.scene import Scene
 
@@ -33,7 +33,14 @@ _Heights = tuple[IntArray, FloatArray, FloatArray, FloatArray]
 _NOTHING: _Heights = np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros(0)
 
 
-def surface_noise_px(scene: Scene, options: StructureOptions) -> float:
+def landmark_noise(scene: Scene, options: StructureOptions) -> tuple[PointNoise, LineNoise]:
+    """Return the noise of points and lines, which does not depend on the planes that are found in them."""
+    return point_noise(scene, options.point_sigma_px), line_noise(scene, options.line_sigma_px)
+
+
+def surface_noise_px(
+    scene: Scene, options: StructureOptions, noise: tuple[PointNoise, LineNoise] | None = None
+) -> float:
     """Return the standard deviation of landmarks from the planes that they lie on, as a length in the images, pixels.
 
     Parameters
@@ -43,8 +50,10 @@ def surface_noise_px(scene: Scene, options: StructureOptions) -> float:
     options : StructureOptions
         What they were found with. No more than its ``surface_sigma_px`` is returned, and that where nothing is on a
         plane.
+    noise : optional
+        :func:`landmark_noise` of the scene, where it is known already.
     """
-    plane, height, variance, length = _heights(scene, options)
+    plane, height, variance, length = _heights(scene, noise or landmark_noise(scene, options))
     count = np.bincount(plane, minlength=scene.num_planes)[plane]
     told = count > _UNKNOWNS
     squared = height[told] ** 2 * count[told] / (count[told] - _UNKNOWNS)
@@ -56,7 +65,7 @@ def plane_noise_px(scene: Scene, options: StructureOptions) -> FloatArray:
 
     Parameters are those of :func:`surface_noise_px`.
     """
-    plane, height, variance, length = _heights(scene, options)
+    plane, height, variance, length = _heights(scene, landmark_noise(scene, options))
     count = np.bincount(plane, minlength=scene.num_planes)
     out = np.full(scene.num_planes, options.surface_sigma_px)
     for k in np.flatnonzero(count > _UNKNOWNS):
@@ -76,33 +85,32 @@ def _upper_end(squared: FloatArray, variance: FloatArray, length: FloatArray, mo
     return float(tried[np.flatnonzero(surprise <= surprise.min() + 1.0)[-1]])
 
 
-def _heights(scene: Scene, options: StructureOptions) -> _Heights:
+def _heights(scene: Scene, noise: tuple[PointNoise, LineNoise]) -> _Heights:
     """Of points and of the ends of lines on planes."""
-    points, lines = _of_points(scene, options.point_sigma_px), _of_lines(scene, options.line_sigma_px)
+    points, lines = _of_points(scene, noise[0]), _of_lines(scene, noise[1])
     plane, height = np.concatenate([points[0], lines[0]]), np.concatenate([points[1], lines[1]])
     return plane, height, np.concatenate([points[2], lines[2]]), np.concatenate([points[3], lines[3]])
 
 
-def _of_points(scene: Scene, sigma_px: float | None) -> _Heights:
+def _of_points(scene: Scene, noise: PointNoise) -> _Heights:
     """Planes of points, heights over them, their own variances, and the length of a pixel there."""
     if len(scene.relations.point_on_plane) == 0:
         return _NOTHING
     common = scene.relations.sigma("point_on_plane") == 0.0  # others have a deviation of their own
     point, plane = scene.relations.point_on_plane[common].T
     normal, offset = scene.planes.hesse[plane, :3], scene.planes.hesse[plane, 3]
-    covariance = point_noise(scene, sigma_px).covariance[point]
+    covariance = noise.covariance[point]
     variance = np.einsum("ni,nij,nj->n", normal, covariance, normal)
     height = np.einsum("ni,ni->n", scene.points.xyz[point], normal) + offset
     return plane, height, variance, lengths_per_pixel(scene, "point")[point]
 
 
-def _of_lines(scene: Scene, sigma_px: float | None) -> _Heights:
+def _of_lines(scene: Scene, noise: LineNoise) -> _Heights:
     """The same of both ends of lines."""
     if len(scene.relations.line_on_plane) == 0:
         return _NOTHING
     line, plane = scene.relations.line_on_plane[scene.relations.sigma("line_on_plane") == 0.0].T
     normal, offset = scene.planes.hesse[plane, :3], scene.planes.hesse[plane, 3]
-    noise = line_noise(scene, sigma_px)
     slope = np.einsum("nai,ni->na", noise.across[line], normal)
     blocks = noise.covariance[line].reshape(-1, 2, 2, 2, 2)
     variance = np.einsum("na,neaeb,nb->ne", slope, blocks, slope)

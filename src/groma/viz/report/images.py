@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.execution import map_in_threads
+from groma.execution import begin
 from groma.scene.line_intervals import one_line_per_interval
 from groma.viz.pack import pack, pack_whole, thin
 from groma.viz.pictures import ImageFiles, image_file, jpeg_address, read_picture, warn_of_names_outside
@@ -29,9 +29,39 @@ PHOTO_SIZE = 1100
 PHOTO_BUDGET = 9_000_000
 #: Places along the image of a segment that lens distortion bends.
 _SAMPLES = 6
+#: Gives data addresses of photographs, in the order of the images that observe something.
+Photographs = Callable[[], list[str]]
 
 
-def image_data(scene: Scene, kept: Kept, states: Sequence[Drawable], images: ImageFiles | None) -> dict[str, Any]:
+def page_photographs(scene: Scene, images: ImageFiles | None) -> Photographs:
+    """Begin to read the photographs of a page, smaller the more there are; empty where there is none.
+
+    They depend on which images observe something alone: a page that is written later need not wait for them.
+    """
+    return _photographs([scene.images.names[image] for image in _used(scene)], images)
+
+
+def _photographs(names: Sequence[str], images: ImageFiles | None) -> Photographs:
+    warn_of_names_outside(images, names)
+    files = {place: path for place, name in enumerate(names) if (path := image_file(images, name)) is not None}
+    chosen = np.array(list(files))[thin(len(files), MAX_PHOTOS)].tolist() if files else []
+    budget = PHOTO_BUDGET // max(len(chosen), 1)
+    begun = {place: begin(partial(_photograph, files[place], budget)) for place in chosen}
+    return lambda: [begun[place]() if place in begun else "" for place in range(len(names))]
+
+
+def _photograph(file: Path, budget: int) -> str:
+    picture = read_picture(file, PHOTO_SIZE)
+    return "" if picture is None else jpeg_address(picture, budget)
+
+
+def _used(scene: Scene) -> IntArray:
+    """Return the images that observe something."""
+    seen = scene.point_observations.image_idx, scene.line_observations.image_idx
+    return np.flatnonzero(sum(np.bincount(one, minlength=scene.num_images) for one in seen))
+
+
+def image_data(scene: Scene, kept: Kept, states: Sequence[Drawable], photographs: Photographs) -> dict[str, Any]:
     """Return, for the page, an entry per image that observes something, and the rows that the entries point to.
 
     ``first`` is the entry to begin with. ``rows`` are points: measured place, then the residual in each state.
@@ -47,11 +77,20 @@ def image_data(scene: Scene, kept: Kept, states: Sequence[Drawable], images: Ima
     samples = 2 if all(is_straight(name) for name in scene.cameras.models) else _SAMPLES
     points_seen = np.bincount(scene.point_observations.image_idx, minlength=scene.num_images)
     lines_seen = np.bincount(seen.image_idx, minlength=scene.num_images)
-    used = np.flatnonzero(points_seen + lines_seen)
-    photos = _photographs([scene.images.names[image] for image in used], images)
+    used = _used(scene)
     ends = np.cumsum([[len(point_rows[image]), len(segment_rows[image])] for image in [*used]] or [[0, 0]], axis=0)
     begins = np.vstack([[0, 0], ends[:-1]])
-    entries = []
+    rows, segments = (
+        np.concatenate([*(groups[image] for image in used), np.zeros(0, np.int64)]).astype(np.int64)
+        for groups in (point_rows, segment_rows)
+    )
+    projected = [
+        _projected(pieces, image, pieces.line_observations.line_idx[segment_rows[image]], samples)
+        for image in used.tolist()
+    ]
+    ways = [state.residuals[num_points:].reshape(-1, 4)[segments] for state in states]
+    point_ways = [state.residuals[:num_points][rows] for state in states]
+    entries, photos = [], photographs()
     for place, image in enumerate(used.tolist()):
         left, top, width, height = _frame(after, image)
         entries.append(
@@ -67,16 +106,6 @@ def image_data(scene: Scene, kept: Kept, states: Sequence[Drawable], images: Ima
                 "photo": photos[place] if left == top == 0.0 else "",
             }
         )
-    rows, segments = (
-        np.concatenate([*(groups[image] for image in used), np.zeros(0, np.int64)]).astype(np.int64)
-        for groups in (point_rows, segment_rows)
-    )
-    projected = [
-        _projected(pieces, image, pieces.line_observations.line_idx[segment_rows[image]], samples)
-        for image in used.tolist()
-    ]
-    ways = [state.residuals[num_points:].reshape(-1, 4)[segments] for state in states]
-    point_ways = [state.residuals[:num_points][rows] for state in states]
     return {
         "images": entries,
         "first": _first(entries),
@@ -129,20 +158,3 @@ def _frame(scene: Drawable, index: int) -> tuple[float, float, float, float]:
     left, top = low - margin
     width, height = np.maximum(high - low, 1.0) + 2 * margin
     return float(left), float(top), float(width), float(height)
-
-
-def _photographs(names: Sequence[str], images: ImageFiles | None) -> list[str]:
-    """Return the photographs as data addresses, smaller the more there are; empty where there is none."""
-    found = ["" for _ in names]
-    warn_of_names_outside(images, names)
-    files = {place: path for place, name in enumerate(names) if (path := image_file(images, name)) is not None}
-    chosen = np.array(list(files))[thin(len(files), MAX_PHOTOS)].tolist() if files else []
-    show = partial(_photograph, budget=PHOTO_BUDGET // max(len(chosen), 1))
-    for place, address in zip(chosen, map_in_threads(show, [files[place] for place in chosen]), strict=True):
-        found[place] = address
-    return found
-
-
-def _photograph(file: Path, budget: int) -> str:
-    picture = read_picture(file, PHOTO_SIZE)
-    return "" if picture is None else jpeg_address(picture, budget)

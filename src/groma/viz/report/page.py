@@ -17,6 +17,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -25,7 +26,7 @@ import numpy as np
 
 from groma._version import __version__
 from groma.errors import InputError, OutputError
-from groma.execution import beside
+from groma.execution import begin
 from groma.scene.checks import check_scene_given
 from groma.viz.drawable import Drawable, drawable
 from groma.viz.pack import script_json
@@ -33,7 +34,7 @@ from groma.viz.pictures import ImageFiles
 from groma.viz.report import tables as _page_tables
 from groma.viz.report.covariances import LandmarkCovariances
 from groma.viz.report.data import scene_data
-from groma.viz.report.images import image_data
+from groma.viz.report.images import Photographs, image_data, page_photographs
 from groma.viz.report.kept import kept
 
 if TYPE_CHECKING:
@@ -86,6 +87,8 @@ class PageContents:
     cards: str = ""
     #: HTML of the large numbers instead of the usual ones.
     tiles: str | None = None
+    #: What :func:`~groma.viz.report.images.page_photographs` began; by default they are read now.
+    photographs: Photographs | None = None
     #: Covariances of ``scene_after``: what is measured on the page then has standard deviations.
     covariances: LandmarkCovariances | None = None
 
@@ -125,8 +128,9 @@ def write_report(
         If the file cannot be written.
     """
     check_scene_given(scene_after, "scene_after")
+    drawn = None if scene_before is None else begin(partial(drawable, scene_before))
     after = drawable(scene_after)
-    before = drawable(scene_before) if scene_before is not None else None
+    before = None if drawn is None else drawn()
     if before is not None and not _same_shape(before, after):
         raise InputError(
             "scene_before and scene_after must hold the same images, landmarks and observations, in the same order; "
@@ -143,9 +147,8 @@ def write_report(
         diagnosis = numbers.get("diagnosis")
     script = '"use strict";\n' + "".join(_part(f"{name}.js") for name in SCRIPTS)
     held = kept(scene_after)
-    of_scene: list[dict[str, Any]] = []
-    with beside(lambda: of_scene.append(scene_data(scenes, states, held, said.covariances))):
-        of_images = image_data(scene_after, held, states, images)
+    of_scene = begin(partial(scene_data, scenes, states, held, said.covariances))
+    photographs = said.photographs or page_photographs(scene_after, images)
     parts = {
         "POLICY": _policy(script),
         "STYLE": _part("page.css"),
@@ -160,7 +163,7 @@ def write_report(
         ),
         "TABLES": _page_tables.number_tables(scene_after, before, after, numbers),
         "FOOTER": _footer(),
-        "DATA": script_json(of_scene[0] | of_images),
+        "DATA": script_json(of_scene() | image_data(scene_after, held, states, photographs)),
         "SCRIPT": script,
     }
     page = re.sub(r"\{\{([A-Z]+)\}\}", lambda match: parts[match[1]], _part("page.html"))

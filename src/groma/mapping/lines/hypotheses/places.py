@@ -17,7 +17,7 @@ import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
-from groma.execution import map_work, num_calls
+from groma.execution import map_largest_first, map_work, num_calls
 from groma.mapping.groups import grouped
 from groma.mapping.lines.clusters import Cluster, clusters
 from groma.mapping.lines.hypotheses.consensus import choose
@@ -121,7 +121,8 @@ def find_places(
         by_part = [place for places in map_work(_places_of, parts, progress) for place in places]
         found = [by_part[place] for place in in_order]
     else:
-        found = map_work(partial(_places_in, proposer, matches), work, progress)
+        sizes = [int(own) * len(others) for own, others in zip(np.diff(views.pointers), neighbors, strict=True)]
+        found = map_largest_first(partial(_places_in, proposer, matches), work, sizes, progress)
     found = [Places.none(0, max(1, options.num_neighbors), Outcome.NO_MATCH), *found]
     columns = {name: np.concatenate([getattr(one, name) for one in found]) for name in Places.names()}
     columns["rejection"][~views.usable] = Outcome.TOO_SHORT
