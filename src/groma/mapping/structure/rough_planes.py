@@ -279,7 +279,7 @@ def _members_of(
     point, line = points.pairs[of_points, 0], lines.pairs[of_lines, 0]
     return (
         np.concatenate([marks.points[point], marks.segments[line].reshape(-1, 3)]),
-        np.concatenate([marks.point_noise.covariance[point], marks.line_noise.ends()[line].reshape(-1, 3, 3)]),
+        np.concatenate([marks.point_noise.covariance[point], marks.line_noise.ends(line).reshape(-1, 3, 3)]),
         rough * np.concatenate([marks.point_pixel[point], np.repeat(marks.line_pixel[line], 2)]),
         np.concatenate([points.probability[of_points], np.repeat(lines.probability[of_lines], 2)]),
     )
