@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from groma.adjustment.graphs.linear_start import linear_start
 from groma.adjustment.graphs.pose_graph import PoseGraphOptions, adjust_pose_graph
 from groma.errors import InputError
 from groma.geometry import quaternion, se3
@@ -68,8 +69,50 @@ def test_the_start_is_the_cheaper_of_poses_and_motions(rng):
     held = np.zeros(40, dtype=bool)
     held[20] = True
     kept = adjust_pose_graph(unknown.replace(poses=unknown.poses.replace(held=held)))
-    assert not kept.from_motions
+    assert kept.from_motions and kept.report.final_cost == pytest.approx(result.report.final_cost, rel=1e-6)
     np.testing.assert_array_equal(kept.graph.poses.world_from_body[20], zero[20])
+
+
+def lattice(rng, side, noise):
+    """Poses on a square lattice, turned at random, with motions to their neighbours whose angles and lengths err."""
+    count, at = side * side, np.arange(side * side).reshape(side, side)
+    places = np.stack([*np.divmod(np.arange(count), side), np.zeros(count)], axis=1)
+    truth = se3.exp(np.hstack([np.zeros((count, 3)), rng.normal(size=(count, 3))]))
+    truth[:, 4:] = places
+    first = np.concatenate([at[:, :-1].ravel(), at[:-1].ravel()])
+    second = np.concatenate([at[:, 1:].ravel(), at[1:].ravel()])
+    motion = se3.compose(se3.inverse(truth[first]), truth[second])
+    motion = se3.compose(motion, se3.exp(noise * rng.normal(size=(len(first), 6))))
+    information = np.tile(np.eye(6) / noise**2, (len(first), 1, 1))
+    return PoseGraph(GraphPoses(np.arange(count), truth), Motions(first, second, motion, information))
+
+
+def test_noisy_turns_end_in_the_minimum_of_the_truth(rng):
+    """Errors of 0.25 rad add up along a chain of motions to half a turn: only all motions together lead back."""
+    graph = lattice(rng, 16, 0.25)
+    best = adjust_pose_graph(graph).report.final_cost
+    unknown = graph.replace(poses=graph.poses.replace(world_from_body=np.tile(se3.identity(), (256, 1))))
+    found = adjust_pose_graph(unknown)
+    assert found.from_motions and found.report.final_cost == pytest.approx(best, rel=1e-5)
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_the_linear_start_is_exact_without_noise(rng, planar):
+    truth, graph = ring(rng, planar=planar)
+    held = np.arange(len(truth)) == 3
+    start = linear_start(disturbed(rng, graph.replace(poses=graph.poses.replace(held=held)), 0.3), held)
+    moved = se3.compose(se3.inverse(start.poses.world_from_body[:1]), start.poses.world_from_body)
+    expected = se3.compose(se3.inverse(truth[:1]), truth)
+    np.testing.assert_allclose(se3.log(se3.compose(se3.inverse(expected), moved)), 0.0, atol=1e-8)
+
+
+def test_motions_without_information_give_no_linear_start(rng):
+    _, graph = ring(rng, noise=0.01)
+    information = graph.motions.information.copy()
+    information[(graph.motions.first_idx == 5) | (graph.motions.second_idx == 5)] = 0.0
+    loose = graph.replace(motions=graph.motions.replace(information=information))
+    assert linear_start(loose, np.arange(12) == 0) is None
+    assert np.isfinite(adjust_pose_graph(disturbed(rng, loose, 0.2)).graph.poses.world_from_body).all()
 
 
 def test_poses_of_the_plane_stay_there(rng):

@@ -96,7 +96,11 @@ def test_poses_that_are_not_given_are_composed(tmp_path):
     ("text", "message"),
     [
         ("", "holds no poses"),
-        ("VERTEX_XY 1 2 3\n", "line 1: 'VERTEX_XY' is not read"),
+        ("VERTEX_XZ 1 2 3\n", "line 1: 'VERTEX_XZ' is not read"),
+        ("VERTEX_XY 1 2 3\n", "line 1: VERTEX_XY is of a graph with landmarks.* remove all lines of landmarks"),
+        (SPACE + "EDGE_SE3_TRACKXYZ 0 1 0 0 0 1 1 0 0 1 0 1\n", "EDGE_SE3_TRACKXYZ is of a graph with landmarks"),
+        (PLANE + "EQUIV 0 9\n", "EQUIV names pose 9"),
+        (PLANE + "EQUIV 0\n", "takes 2 numbers; got 1"),
         ("VERTEX_SE2 1 2 3\n", "takes 4 numbers; got 3"),
         ("VERTEX_SE2 1 2 3 x\n", r"line 1: expected 4 finite numbers after VERTEX_SE2; got 'x'"),
         ("VERTEX_SE2 1 2 3 nan\n", r"line 1: expected 4 finite numbers .*; got 'nan'"),
@@ -135,6 +139,22 @@ def test_planar_graphs_of_toro_hold_the_same(tmp_path):
     assert read.planar
     np.testing.assert_array_equal(read.poses.world_from_body, same.poses.world_from_body)
     np.testing.assert_array_equal(read.motions.information, same.motions.information)
+
+
+def test_poses_of_two_names_are_one(tmp_path):
+    """Chains of EQUIV too: 4 is 2 is 0; a motion from a pose to itself says nothing."""
+    motion = "1 2 0.5 4 1 5 16 2 3\n"
+    vertices = "".join(f"VERTEX2 {name} {name} 0 0\n" for name in range(5))
+    edges = f"EDGE2 0 1 {motion}EDGE2 1 2 {motion}EDGE2 2 3 {motion}EDGE2 3 4 {motion}EDGE2 2 4 {motion}"
+    read = read_g2o(file_with(tmp_path, f"{vertices}{edges}EQUIV 4 2\nEQUIV 2 0\nFIX 2\n", "a.graph"))
+    edges = f"EDGE2 0 1 {motion}EDGE2 1 0 {motion}EDGE2 0 3 {motion}EDGE2 3 0 {motion}"
+    kept = "".join(f"VERTEX2 {name} {name} 0 0\n" for name in (0, 1, 3))
+    same = read_g2o(file_with(tmp_path, f"{kept}{edges}FIX 0\n", "b.graph"))
+    for name, value in [*vars(read.poses).items(), *vars(read.motions).items()]:
+        expected = getattr(same.poses, name, getattr(same.motions, name, None))
+        np.testing.assert_array_equal(value, expected)
+    edges = f"EDGE2 0 1 {motion}EDGE2 1 2 {motion}EQUIV 2 0\n"
+    assert read_g2o(file_with(tmp_path, edges, "c.graph")).poses.ids.tolist() == [0, 1]  # without poses
 
 
 def test_graphs_of_toro_in_space_hold_the_same(rng, tmp_path):

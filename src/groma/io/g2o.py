@@ -11,6 +11,7 @@ r"""Pose graphs in the text formats of g2o and TORO, plain or compressed by gzip
 ``EDGE2``             TORO: two ids, x y angle, and the information as xx xy yy aa xa ya
 ``VERTEX3``           TORO: id, x y z, roll pitch yaw
 ``EDGE3``             TORO: two ids, x y z, roll pitch yaw, and perhaps the upper triangle of the information (else 1)
+``EQUIV``             TORO: two ids of one and the same pose, which is read once, under the first id that it has
 ====================  =============================================================================================
 
 g2o states the rotation error of ``EDGE_SE3:QUAT`` as the vector part of a quaternion, which is half the angle. Here
@@ -20,7 +21,8 @@ errors are in radians, so the information is
 
 Other readers take the numbers as they are, and thereby rotations for twice as certain as they were written. TORO's
 angles are whole angles. Roll, pitch and yaw turn about x, then y, then z of the first body: ``R = R_z R_y R_x``.
-Lines with ``#`` and parameters of sensors (``PARAMS_...``) are passed over; other vertices and edges are refused.
+Lines with ``#`` and parameters of sensors (``PARAMS_...``) are passed over; other vertices and edges are refused, those
+of landmarks (``VERTEX_XY``, ``VERTEX_TRACKXYZ``) too: without them the poses would end elsewhere.
 
 Reference: R. Kuemmerle, G. Grisetti, H. Strasdat, K. Konolige, W. Burgard, *g2o: a general framework for graph
 optimization*, ICRA 2011, and its ``EdgeSE3::computeError``. G. Grisetti, C. Stachniss, S. Grzonka, W. Burgard, *TORO*,
@@ -57,6 +59,8 @@ _TORO = {
     "VERTEX3": (7, "VERTEX_SE3:QUAT"),
     "EDGE3": (29, "EDGE_SE3:QUAT"),
 }
+#: What begins the tags of landmarks, and of their measurements, and ends that of a pose with a landmark.
+_LANDMARKS = ("VERTEX_XY", "VERTEX_TRACKXYZ", "EDGE_SE2_XY", "EDGE_SE3_TRACKXYZ", "EDGE_SE3_XYZ", "EDGE_BEARING_SE2_XY")
 #: Numbers of an edge of TORO in space that states no information (file format).
 _BARE_EDGE3 = 8
 #: Larger numbers are not exact as floating point (derived from the precision of doubles).
@@ -145,15 +149,51 @@ def _rows_by_tag(path: Path) -> dict[str, array[float]]:
             rows.setdefault(tag, array("d")).extend(finite(words, place, "ids of poses"))
             continue
         expected = _NUMBERS.get(tag) or _TORO.get(tag, (0, ""))[0]
+        if tag == "EQUIV":
+            expected = 2
         if not expected:
-            known = ", ".join((*_NUMBERS, *_TORO))
-            raise FileFormatError(f"{place}: {tag[:40]!r} is not read; a pose graph has {known} and FIX.")
+            raise FileFormatError(f"{place}: {_why_not(tag)}")
         if tag == "EDGE3" and len(words) == _BARE_EDGE3:
             words = [*words, *_ONE]
         if len(words) != expected:
             raise FileFormatError(f"{place}: {tag} takes {expected} numbers; got {len(words)}. Is it cut off?")
         rows.setdefault(tag, array("d")).extend(finite(words, place, f"{expected} finite numbers after {tag}"))
     return rows
+
+
+def _why_not(tag: str) -> str:
+    if tag in _LANDMARKS:
+        return (
+            f"{tag} is of a graph with landmarks; groma adjusts graphs of poses. To adjust the poses by the motions "
+            f"between them alone, remove all lines of landmarks: {', '.join(_LANDMARKS)}."
+        )
+    return f"{tag[:40]!r} is not read; a pose graph has {', '.join((*_NUMBERS, *_TORO))}, EQUIV and FIX."
+
+
+def _without_equivalents(rows: dict[str, array[float]], path: Path) -> dict[str, array[float]]:
+    """Return rows of g2o with every pose that EQUIV gives several ids under the first of them alone."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    if "EQUIV" not in rows:
+        return rows
+    ids, ends = np.unique(_integers(np.array(rows["EQUIV"]), path), return_inverse=True)
+    graph = coo_matrix((np.ones(len(ends) // 2), (ends[0::2], ends[1::2])), shape=(len(ids), len(ids)))
+    part = connected_components(graph, directed=False)[1]
+    first = ids[np.unique(part, return_index=True)[1][part]]
+    result, named = {"FIX": rows.get("FIX", array("d"))}, [np.zeros(0)]
+    for tag in ("FIX", *(rows.keys() & _NUMBERS.keys())):
+        ends_of, width = (2, _NUMBERS[tag]) if tag.startswith("EDGE") else (1, _NUMBERS.get(tag, 1))
+        table = np.array(rows.get(tag, [])).reshape(-1, width)
+        named.append(table[:, :ends_of].reshape(-1))
+        at = np.minimum(np.searchsorted(ids, table[:, :ends_of]), len(ids) - 1)
+        names = np.where(ids[at] == table[:, :ends_of], first[at], table[:, :ends_of])
+        kept = names[:, 0] != names[:, 1] if ends_of == 2 else (names[:, 0] == table[:, 0]) | (tag == "FIX")
+        result[tag] = array("d", np.hstack([names, table[:, ends_of:]])[kept].ravel())
+    missing = ids[~np.isin(ids, np.concatenate(named))]
+    if len(missing):
+        raise FileFormatError(f"{path}: EQUIV names pose {missing[0]}, which is not there.")
+    return result
 
 
 def _without_toro(rows: dict[str, array[float]]) -> dict[str, array[float]]:
@@ -176,7 +216,7 @@ def _without_toro(rows: dict[str, array[float]]) -> dict[str, array[float]]:
 
 
 def _graph(rows: dict[str, array[float]], path: Path) -> PoseGraph:
-    rows = _without_toro(rows)
+    rows = _without_equivalents(_without_toro(rows), path)
     planar = "VERTEX_SE2" in rows or "EDGE_SE2" in rows
     if planar and ("VERTEX_SE3:QUAT" in rows or "EDGE_SE3:QUAT" in rows):
         raise FileFormatError(f"{path} mixes poses of the plane (SE2) and of space (SE3); write two graphs.")

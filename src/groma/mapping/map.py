@@ -277,9 +277,10 @@ def map_segments(
         # The lines as mapped are good starts, and only the adjusted ones tell the noise of the segments.
         weighted = _weighted(joint, options)
         earlier = EarlierMap(before, line_map)
+        moved = begin(partial(moved_px, before, joint, GATES.moved_share))
         line_map = stages.run(find_lines_again, joint, segments, matches, neighbors, earlier, tag=tag)
         scene = with_line_depths(line_map.add_to(joint, segments), line_map, segments, depths)
-        if scene.num_lines == 0 or moved_px(before, joint, GATES.moved_share) <= options.lines.noise:
+        if scene.num_lines == 0 or moved() <= options.lines.noise:
             break
     if scene.num_lines:
         factor, scale = 1.0, GATES.last_loss_scale
@@ -291,10 +292,9 @@ def map_segments(
     if options.find_planes:
         noise = begin(partial(landmark_noise, scene, options.structure))
         scene = stages.run(find_planes, scene)
-        surface = surface_noise_px(scene, options.structure, noise())
-        weighted = dataclasses.replace(weighted, structure_sigma_px=surface)
-    observations = {name: getattr(shared(), name) for name in ("point_observations", "line_observations")}
-    scene = scene.replace(**observations)
+        weighted = dataclasses.replace(weighted, structure_sigma_px=surface_noise_px(scene, options.structure, noise()))
+    weights = shared()
+    scene = scene.replace(point_observations=weights.point_observations, line_observations=weights.line_observations)
     adjusted = stages.run(adjust_everything, scene, weighted)
     return result_of(points, scene, adjusted, weighted, line_map, options.min_confidence, not options.refine_poses)
 

@@ -7,7 +7,8 @@ With the measured :math:`Z_{ij}` (``first_from_second``) and poses :math:`X` (``
 
 Place recognition errs now and then, and one wrong motion between distant poses bends the whole graph. A robust loss
 lets go of it, if the poses at the start are about right. The start is the poses of the graph or, where that costs less,
-the motions put one after the other (:meth:`groma.scene.pose_graph.PoseGraph.chained`).
+what follows from the motions alone: put one after the other (:meth:`groma.scene.pose_graph.PoseGraph.chained`), or all
+together in linear systems (:mod:`groma.adjustment.graphs.linear_start`).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 
 from groma._counted import counted
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.adjustment.graphs.linear_start import linear_start
 from groma.adjustment.report import Progress, not_converged
 from groma.errors import InputError, check_kind
 from groma.factors.contract import Ref
@@ -73,7 +75,7 @@ class PoseGraphResult:
     chi_square: FloatArray
     #: Motions beyond the scale of the loss after the adjustment; none for plain least squares.
     outliers: IntArray
-    #: Whether it began from the motions put one after the other, which cost less than the poses that were given.
+    #: Whether it began from poses that follow from the motions alone, which cost less than those that were given.
     from_motions: bool = False
 
     @property
@@ -220,19 +222,25 @@ def motion_factors(motions: Motions, group: str) -> PoseBetween:
 
 
 def _cheaper_start(graph: PoseGraph, problem: Problem) -> Problem:
-    """Return the problem of a graph, or the same with the motions put one after the other where that costs less.
+    """Return the problem of a graph, or the same at poses that follow from its motions where these cost less.
 
-    Poses that are held keep their place: the first of each part does, others are not on the way of the motions.
+    Poses that already agree with the motions within the noise stated for these are taken as they are: the squared error
+    expected at the minimum is the number of residuals beyond that of the unknowns. Poses that are held keep their
+    place; with others than the first of each part, which is where a chain begins, there is no chain.
     """
+    held: BoolArray = np.asarray(np.all(problem.variables["poses"].constant, axis=1))
     is_first = np.zeros(len(graph.poses), dtype=bool)
     is_first[np.unique(graph.parts(), return_index=True)[1]] = True
-    if (graph.poses.held & ~is_first).any():
+    size = 3 if graph.planar else 6
+    if _squared_error(problem) <= size * (len(graph.motions) - len(graph.poses) + int(held.sum())):
         return problem
-    chained = problem.with_states({"poses": se3.inverse(graph.chained().poses.world_from_body)})
-    return chained if _cost(chained) < _cost(problem) else problem
+    chain = None if (graph.poses.held & ~is_first).any() else graph.chained()
+    others = [start.poses.world_from_body for start in (chain, linear_start(graph, held)) if start is not None]
+    starts = [problem, *(problem.with_states({"poses": se3.inverse(poses)}) for poses in others)]
+    return min(starts, key=_squared_error)
 
 
-def _cost(problem: Problem) -> float:
+def _squared_error(problem: Problem) -> float:
     return sum(float(f.loss.evaluate(squared_norms(f, problem.variables))[0].sum()) for f in problem.factors)
 
 

@@ -226,11 +226,10 @@ def map_(
         result = run_map(console, photographs, work, start, options, matches, survey, maps)
         if extended is not None and survey is None:
             result = in_world_of(result, extended.map)
-        shown = result.photographs(photographs)
+        page = {"images": photographs, "photographs": result.photographs(photographs)}
         found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
         numbers = result.summary(found, result.contributions(true) if contributions else ())
-        page = {"images": photographs, "title": f"Map of {images.absolute().name}", "summary": numbers}
-        page["photographs"] = shown
+        page |= {"title": f"Map of {images.absolute().name}", "summary": numbers}
         write_map(console, result, output, work, force, **page)
     end_queries(output)
     say_map(console, result, numbers)

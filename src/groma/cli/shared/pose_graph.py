@@ -55,7 +55,7 @@ def adjust_graph_and_write(
     steps = counted(numbers["iterations"], "steps")
     console.say(f"{costs}, {steps} in {time}. {result.report.termination.sentence}")
     if result.from_motions:
-        console.say("It began from the motions put one after the other: that costs less than the poses of the file.")
+        console.say("It began from poses that follow from the motions alone: they cost less than those of the file.")
     for sentence in result.warnings:
         console.warn(sentence)
     if output is not None:

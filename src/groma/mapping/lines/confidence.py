@@ -22,12 +22,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy  # its parts are imported when something of them is first used
 
 from groma._typing import BoolArray, FloatArray
 from groma.cameras import model as camera_model
+from groma.execution import begin, map_in_threads
 from groma.gates import gate
 from groma.geometry import quaternion, segment2
 from groma.geometry.algebra import norm
@@ -73,8 +75,9 @@ def with_confidence(scene: Scene) -> Scene:
 def line_confidence(scene: Scene) -> FloatArray:
     """Return the probability (L,) that each line is right."""
     noise = line_noise(scene)
+    accuracy = begin(partial(line_accuracy, scene, noise))
     right = scipy.special.expit(line_evidence(scene, noise) @ np.array(list(WEIGHTS.values())))
-    return right * line_accuracy(scene, noise)
+    return right * accuracy()
 
 
 def line_accuracy(scene: Scene, noise: LineNoise | None = None, gates: ConfidenceGates = GATES) -> FloatArray:
@@ -160,16 +163,22 @@ def _spread(scene: Scene, noise: LineNoise) -> FloatArray:
 
 def _num_in_frame(scene: Scene) -> FloatArray:
     """(L,) number of images in whose frame a line lies whole and is long enough to be found."""
-    found, poses = np.zeros(scene.num_lines), scene.cam_from_world
-    for image, camera in enumerate(scene.images.camera_idx):
-        size = np.array([scene.cameras.width[camera], scene.cameras.height[camera]], float)
-        model = camera_model(scene.cameras.models[camera])
-        in_cam = quaternion.rotate(poses[image, :4], scene.lines.segments) + poses[image, 4:]
-        places = np.ascontiguousarray(in_cam.reshape(-1, 3))
-        pixels = model.project(scene.cameras.params[camera, : model.num_parameters], places).reshape(-1, 4)
-        front = np.ones(len(in_cam), bool) if model.sees_behind else (in_cam[..., 2] > 0.0).all(axis=1)
-        found += front & _inside(pixels, size) & (segment2.length(np.nan_to_num(pixels)) >= MIN_LENGTH)
+    found = np.zeros(scene.num_lines)
+    for inside in map_in_threads(partial(_in_frame, scene), range(scene.num_images)):
+        found += inside
     return found
+
+
+def _in_frame(scene: Scene, image: int) -> BoolArray:
+    """(L,) lines that lie whole in the frame of an image and are long enough to be found."""
+    camera, pose = scene.images.camera_idx[image], scene.cam_from_world[image]
+    size = np.array([scene.cameras.width[camera], scene.cameras.height[camera]], float)
+    model = camera_model(scene.cameras.models[camera])
+    in_cam = quaternion.rotate(pose[:4], scene.lines.segments) + pose[4:]
+    places = np.ascontiguousarray(in_cam.reshape(-1, 3))
+    pixels = model.project(scene.cameras.params[camera, : model.num_parameters], places).reshape(-1, 4)
+    front = np.ones(len(in_cam), bool) if model.sees_behind else (in_cam[..., 2] > 0.0).all(axis=1)
+    return front & _inside(pixels, size) & (segment2.length(np.nan_to_num(pixels)) >= MIN_LENGTH)
 
 
 def _inside(pixels: FloatArray, size: FloatArray) -> BoolArray:

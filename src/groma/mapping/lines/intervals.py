@@ -17,14 +17,14 @@ from functools import partial
 
 import numpy as np
 
-from groma._typing import BoolArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.line_intervals import supported_intervals
-from groma.execution import begin
+from groma.execution import begin, map_in_threads
 from groma.gates import gate
 from groma.geometry import segment2
 from groma.geometry.algebra import ratio
 from groma.mapping.lines.gates import AGREEMENT
-from groma.mapping.noise.landmarks import line_end_rows, line_sigma_px
+from groma.mapping.noise.landmarks import LineEndRows, line_end_rows, line_sigma_px
 from groma.scene import LineIntervals, Scene
 from groma.scene.line_intervals import observed_shares
 
@@ -42,6 +42,8 @@ class SupportGates:
 GATES = SupportGates()
 #: Smallest share of an eigenvalue that counts (convention: rounding): a single image leaves one direction open.
 _SINGULAR = 1e-9
+#: Segments in a piece of work (cost: memory, and pieces so small that handing them over takes longer than they do).
+_AT_ONCE = 4096
 
 
 def with_supported_intervals(scene: Scene) -> Scene:
@@ -81,22 +83,30 @@ def with_supported_intervals(scene: Scene) -> Scene:
 
 def _beside_edges(scene: Scene) -> BoolArray:
     """Tell beside which parts (L, 24) of lines their edges lie."""
-    ends = line_end_rows(scene)
-    share, residual, row = ends.share, ends.residual, ends.row
-    middle, width = (np.arange(GATES.parts) + 0.5) / GATES.parts, AGREEMENT.same_edge
-    known = np.asarray(ends.good.all(axis=1), np.bool_)
-    low, high = np.sort(share, axis=1).T
-    seen, part = np.nonzero((low[:, None] <= middle) & (middle <= high[:, None]) & known[:, None])
-    weight = (middle[part] - share[seen, 0]) / (share[seen, 1] - share[seen, 0])
-    away = residual[seen, 0] + weight * (residual[seen, 1] - residual[seen, 0])
-    x, y = (row[seen, 0] + weight[:, None] * (row[seen, 1] - row[seen, 0])).T
-    place, size = scene.line_observations.line_idx[seen] * GATES.parts + part, scene.num_lines * GATES.parts
-    count, leaving, xx, xy, yy, xr, yr = (
-        np.bincount(place, value, size)
-        for value in (np.ones(len(x)), np.abs(away) > width, x * x, x * y, y * y, x * away, y * away)
-    )  # fmt: skip
+    ends, width, size = line_end_rows(scene), AGREEMENT.same_edge, scene.num_lines * GATES.parts
+    lines, starts = scene.line_observations.line_idx, range(0, max(len(ends.share), 1), _AT_ONCE)
+    found = map_in_threads(partial(_shown_parts, ends, lines), [slice(start, start + _AT_ONCE) for start in starts])
+    place, *values = (np.concatenate(columns) for columns in zip(*found, strict=True))
+    count, leaving, xx, xy, yy, xr, yr = (np.bincount(place, value, size) for value in values)
     xx, yy = xx + _SINGULAR * (xx + yy), yy + _SINGULAR * (xx + yy)
     determinant = xx * yy - xy**2
     explained = ratio(yy * xr**2 - 2.0 * xy * xr * yr + xx * yr**2, determinant, determinant > 0.0, 0.0)
     noise = AGREEMENT.max_squared(2) * line_sigma_px(scene, ends) ** 2
     return ((explained > width**2 * count + noise) & (leaving >= GATES.min_leaving)).reshape(-1, GATES.parts)
+
+
+def _shown_parts(ends: LineEndRows, line_idx: IntArray, rows: slice) -> tuple[FloatArray | IntArray, ...]:
+    """Return the parts of lines that some segments show, and of each what is summed: one for the segment, whether it
+    leaves the line, and the products of the formula above.
+    """
+    share, residual, row = ends.share[rows], ends.residual[rows], ends.row[rows]
+    middle = (np.arange(GATES.parts) + 0.5) / GATES.parts
+    known = np.asarray(ends.good[rows].all(axis=1), np.bool_)
+    low, high = np.sort(share, axis=1).T
+    seen, part = np.nonzero((low[:, None] <= middle) & (middle <= high[:, None]) & known[:, None])
+    weight = (middle[part] - share[seen, 0]) / (share[seen, 1] - share[seen, 0])
+    away = residual[seen, 0] + weight * (residual[seen, 1] - residual[seen, 0])
+    x, y = (row[seen, 0] + weight[:, None] * (row[seen, 1] - row[seen, 0])).T
+    leaves = np.abs(away) > AGREEMENT.same_edge
+    place = line_idx[rows][seen] * GATES.parts + part
+    return place, np.ones(len(x)), leaves, x * x, x * y, y * y, x * away, y * away

@@ -220,8 +220,12 @@ def project_points(
 def pixels_of(scene: Scene, image_idx: IntArray, places: FloatArray) -> FloatArray:
     """Pixels (N, 2) of points in the world; NaN behind the camera."""
     pixels = np.full((len(places), 2), np.nan)
-    for front, found, _ in _projected(scene, image_idx, places):
-        pixels[front] = found
+
+    def fill(part: slice) -> None:
+        for front, found, _ in _projected(scene, image_idx[part], places[part]):
+            pixels[part][front] = found
+
+    map_ranges(fill, len(places), _ROWS_AT_ONCE)
     return pixels
 
 

@@ -128,8 +128,9 @@ def write_report(
         If the file cannot be written.
     """
     check_scene_given(scene_after, "scene_after")
+    drawn = None if scene_before is None else begin(partial(drawable, scene_before))
     after = drawable(scene_after)
-    before = drawable(scene_before) if scene_before is not None else None
+    before = None if drawn is None else drawn()
     if before is not None and not _same_shape(before, after):
         raise InputError(
             "scene_before and scene_after must hold the same images, landmarks and observations, in the same order; "

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.batch_least_squares import PROBLEMS_AT_ONCE
 from groma.estimators.two_point_line import across_basis, line_residuals
-from groma.execution import map_ranges
+from groma.execution import begin, map_ranges
 from groma.gates import gate
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.linking.tracks import Tracks
@@ -203,6 +204,7 @@ class _Pairs:
 def _compare(tracks: Tracks, gates: MergeGates) -> _Pairs:
     """Pairs of lines that are near each other."""
     views, count, X = tracks.views, tracks.num_lines, tracks.lines
+    unit = begin(partial(_pixel_size, tracks))
     rows, pointers = tracks.table()
     H, U = np.zeros((count, 4, 4)), np.zeros((count, 2, 3))
     own = np.column_stack([views.ends[rows], tracks.sigma[rows]])
@@ -212,10 +214,9 @@ def _compare(tracks: Tracks, gates: MergeGates) -> _Pairs:
         _information(views.camera, image, own, pointers[part.start : part.stop + 1], X[part], H[part], U[part])
 
     map_ranges(inform, count, PROBLEMS_AT_ONCE)
-    unit = _pixel_size(tracks)
-    pairs, span = _candidates(X, gates.max_distance * unit, gates)
-    a, b = pairs.T
-    covariance = np.linalg.inv(H + 1e-9 * np.einsum("nii->n", H)[:, None, None] * np.eye(4))
+    noise = begin(lambda: np.linalg.inv(H + 1e-9 * np.einsum("nii->n", H)[:, None, None] * np.eye(4)))
+    pairs, span = _candidates(X, gates.max_distance * unit(), gates)
+    (a, b), covariance = pairs.T, noise()
     along = X[b, 1] - X[b, 0]
     places = X[a, None, 0] + span[:, :, None] * (X[a, 1] - X[a, 0])[:, None]
     on_b = np.einsum("mkc,mc->mk", places - X[b, None, 0], along) / (along**2).sum(-1)[:, None]
@@ -227,7 +228,7 @@ def _compare(tracks: Tracks, gates: MergeGates) -> _Pairs:
         weight = np.stack([1.0 - at, at], axis=-1)  # of both points, at both places
         gain = np.einsum("mkp,mij->mkipj", weight, basis).reshape(-1, 4, 4)
         spread += gain @ covariance[n] @ np.swapaxes(gain, 1, 2)
-    return _Pairs(pairs, offset, spread, np.minimum(unit[a], unit[b]))
+    return _Pairs(pairs, offset, spread, np.minimum(unit()[a], unit()[b]))
 
 
 def _candidates(X: FloatArray, reach: FloatArray, gates: MergeGates = MergeGates()) -> tuple[IntArray, FloatArray]:
