@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 from groma import _numba
-from groma._kernels.inner import Pipeline, _NoMachineCode
+from groma._kernels import inner
+from groma._kernels.inner import Pipeline, _for_linking, _NoMachineCode
 from groma.compiled import kernel, loop
 
 pytestmark = [
@@ -189,3 +190,28 @@ def test_another_process_links_what_this_one_has_kept(tmp_path):
     assert run("largest", "square", "total") == ["1.0", "4.0", "3.0", "0", "3"]
     sizes = sorted(file.stat().st_size for file in Path(tmp_path).rglob("*.square-*.nbc"))
     assert len(sizes) == 2 and sizes[0] < 0.7 * sizes[1]
+
+
+@loop
+def _kept_positive(values):
+    kept = np.empty(values.shape[0])
+    count = 0
+    for k in range(values.shape[0]):
+        if values[k] > 0.0:
+            kept[count] = values[k]
+            count += 1
+    return kept[:count]
+
+
+def test_numba_uses_its_own_functions_after_they_were_compiled_for_linking(monkeypatch, tmp_path):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    made = []
+    monkeypatch.setattr(inner, "_for_linking", lambda dispatcher: made.append(_for_linking(dispatcher)) or made[-1])
+    wanted = VALUES[VALUES > 1.0] - 1.0
+    assert np.array_equal(_kept_positive(VALUES - 1.0), wanted)
+    assert made and not any(any(_has_machine_code(function)) for function in made)
+    assert np.array_equal(numba.njit(_kept_positive.py_func)(VALUES - 1.0), wanted)
+    for function in made:  # as for a call from Python
+        for kinds in list(function.overloads):
+            function.compile(kinds)
+        assert all(_has_machine_code(function))

@@ -19,7 +19,7 @@ from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pieces import cells_elsewhere
 from groma.localization.pose.refinement import _of_normal_noise, _pull, fitted, last_scale, refine
-from groma.localization.pose.verdict import votes_of_a_rival
+from groma.localization.pose.verdict import evidence_of, votes_of_a_rival
 
 #: What wrong matches may still do: the loss leaves them a small weight. A pixel is 0.007 here.
 OUTLIERS = 5e-4
@@ -257,7 +257,8 @@ def test_poses_with_too_few_votes_are_not_judged():
     """What else would be asked of them is not."""
     world = make_world(np.random.default_rng(2), points=200)
     matches = Matches(world.points2d, world.points3d)
-    votes = pose_from_matches(CAMERA, matches).votes
+    found = refine(CAMERA, matches, world.pose, max_errors(matches))
+    votes = evidence_of(found, matches).agree
     asked = []
     for enough in (votes, votes + 1):
         expected = lambda best: asked.append(best) or ((9.0, 0.0), 1.0)  # noqa: E731

@@ -117,12 +117,12 @@ class Motions:
         way = "" if self.share > 0.0 else ", from its last row to its first"
         return told, f"The images are a sequence: reading one takes {abs(self.share):.2g} of the time to the next{way}."
 
-    def warnings(self, gates: RollingShutterGates = GATES) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """Say where motions rest on what was expected of them."""
         if self.left_out:
             return (NOT_ROLLING,)
         told = []
-        if self.spread < gates.parallel:
+        if self.spread < GATES.parallel:
             told.append(
                 f"All images are read along nearly the same direction (within {np.degrees(self.spread):.0f} degrees). "
                 "Motions can then flatten or bend the scene without being noticed, and what holds them is what is "
@@ -131,7 +131,7 @@ class Motions:
             )
         for name, part in (("shifts", slice(0, 3)), ("turns", slice(3, 6))):
             share = float(self.redundancy[:, part].mean())
-            if share < gates.determined:
+            if share < GATES.determined:
                 told.append(
                     f"The {name} of the cameras during the readout rest by {1.0 - share:.0%} on what is expected of "
                     "them, not on the images."
@@ -165,7 +165,7 @@ class RollingShutterResult:
     motions: Motions
 
 
-def with_rolling_shutter(scene: Scene, along: str = "rows", gates: RollingShutterGates = GATES) -> Scene:
+def with_rolling_shutter(scene: Scene, along: str = "rows") -> Scene:
     """Return a scene all of whose images were read row by row, with motions that begin at zero.
 
     Parameters
@@ -174,8 +174,6 @@ def with_rolling_shutter(scene: Scene, along: str = "rows", gates: RollingShutte
         With poses; its motions are forgotten.
     along : "rows" or "columns"
         Images are read row by row, or, as photographs that were turned to stand upright, column by column.
-    gates : RollingShutterGates
-        What is expected before anything is estimated.
 
     Raises
     ------
@@ -198,7 +196,7 @@ def with_rolling_shutter(scene: Scene, along: str = "rows", gates: RollingShutte
     count, centers = scene.num_images, scene.cam_centers_in_world
     nearest = kd_tree(centers).query(centers, k=2)[0][:, 1]
     apart = float(np.median(nearest[nearest > 0.0])) if (nearest > 0.0).any() else 1.0
-    sigma = np.tile(np.repeat([gates.shift * apart, gates.turn], 3), (count, 1))
+    sigma = np.tile(np.repeat([GATES.shift * apart, GATES.turn], 3), (count, 1))
     nothing = np.zeros((count, 6))
     table = CameraMotions(np.arange(count), nothing, nothing, sigma, np.full(count, AXES[along]))
     return scene.replace(camera_motions=table)
@@ -208,7 +206,6 @@ def adjust_rolling_shutter(
     scene: Scene,
     options: AdjustOptions | None = None,
     progress: Callable[[Progress], bool | None] | None = None,
-    gates: RollingShutterGates = GATES,
 ) -> RollingShutterResult:
     """Adjust a scene with motions during the readout, and estimate how well these are known beforehand.
 
@@ -218,40 +215,38 @@ def adjust_rolling_shutter(
         With ``camera_motions``, as from :func:`with_rolling_shutter` or an earlier adjustment.
     options, progress
         As for :func:`groma.adjust`.
-    gates : RollingShutterGates
-        When the estimate has settled.
     """
     options = options or AdjustOptions()
     at_once = adjust(scene.replace(camera_motions=CameraMotions()), options, progress)
     start = scene.camera_motions.sigma[0, [0, 3]]
     quick = replace(options, check_lens=False)
-    for _ in range(gates.max_rounds - 1):
+    for _ in range(GATES.max_rounds - 1):
         result = adjust(scene, quick, progress)
-        found = motions_of(result.scene, result.problem, gates)
-        sigma = np.maximum(found.sigma, gates.smallest * start)
+        found = motions_of(result.scene, result.problem)
+        sigma = np.maximum(found.sigma, GATES.smallest * start)
         before, scene = result.scene.camera_motions, _expecting(result.scene, found.share, sigma)
         ratio = scene.camera_motions.sigma[0] / before.sigma[0]
-        if ratio.max() <= gates.settled and ratio.min() >= 1.0 / gates.settled:
+        if ratio.max() <= GATES.settled and ratio.min() >= 1.0 / GATES.settled:
             break
     result = adjust(scene, options, progress)
-    found = motions_of(result.scene, result.problem, gates)
+    found = motions_of(result.scene, result.problem)
     still, rolling = at_once.report.sigma0, result.report.sigma0
     if still is None or rolling is None:
         return RollingShutterResult(result, found)
     explained = 1.0 - (rolling / still) ** 2
-    if explained < gates.explained:
+    if explained < GATES.explained:
         return RollingShutterResult(at_once, replace(found, explained=explained, left_out=True))
     return RollingShutterResult(result, replace(found, explained=explained))
 
 
-def motions_of(scene: Scene, problem: Problem | None, gates: RollingShutterGates = GATES) -> Motions:
+def motions_of(scene: Scene, problem: Problem | None) -> Motions:
     """Return what an adjusted scene says of motions during the readout, and how well to expect them the next time."""
     table = scene.camera_motions
-    share_of = _redundancy(problem, table, gates)
+    share_of = _redundancy(problem, table)
     known = np.maximum(share_of, 0.05)
     free = table.expected + (table.motion - table.expected) / known  # as if nothing had been expected
     between = motions_between(scene, table.image_idx)
-    share = _share(free, known, between, table.sigma, gates)
+    share = _share(free, known, between, table.sigma)
     left = share_of**2 * (free - share * between) ** 2
     variance = [left[:, part].sum() / max(share_of[:, part].sum(), 1e-9) for part in (slice(0, 3), slice(3, 6))]
     return Motions(
@@ -288,9 +283,9 @@ def _expecting(scene: Scene, share: float, sigma: FloatArray) -> Scene:
     return scene.replace(camera_motions=table.replace(expected=expected, sigma=spread))
 
 
-def _redundancy(problem: Problem | None, table: CameraMotions, gates: RollingShutterGates) -> FloatArray:
+def _redundancy(problem: Problem | None, table: CameraMotions) -> FloatArray:
     """Return the share (N, 6) of each number that the images determine; one where that is not known."""
-    if problem is None or MOTIONS not in problem.variables or len(table) > gates.max_images:
+    if problem is None or MOTIONS not in problem.variables or len(table) > GATES.max_images:
         return np.ones((len(table), 6))
     try:
         covariance = Covariances(problem).of_coordinates(MOTIONS)[:-1]
@@ -300,9 +295,7 @@ def _redundancy(problem: Problem | None, table: CameraMotions, gates: RollingShu
     return np.clip(1.0 - np.where(np.isfinite(variance), variance, np.inf) / table.sigma**2, 0.0, 1.0)
 
 
-def _share(
-    free: FloatArray, known: FloatArray, between: FloatArray, sigma: FloatArray, gates: RollingShutterGates
-) -> float:
+def _share(free: FloatArray, known: FloatArray, between: FloatArray, sigma: FloatArray) -> float:
     """Return the share of the motions between images that explains those during the readout; 0 if chance might."""
     weight = known / sigma**2
     square = float((weight * between**2).sum())
@@ -314,7 +307,7 @@ def _share(
         w, v, d = known[:, part], free[:, part], between[:, part]
         nothing, something = ((w * (v - factor * d) ** 2).sum() for factor in (0.0, share))
         gain += v.size * float(np.log(max(nothing, 1e-300) / max(something, 1e-300)))
-    return share if gain > chi_square_gate(gates.false_alarm, 1) else 0.0
+    return share if gain > chi_square_gate(GATES.false_alarm, 1) else 0.0
 
 
 def _spread(scene: Scene, table: CameraMotions) -> float:

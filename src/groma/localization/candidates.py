@@ -207,10 +207,10 @@ class MirrorImage:
         return found.distance[fit.point_inliers]
 
 
-def closest_of(first: FloatArray, second: FloatArray, gates: MirrorGates = GATES) -> tuple[int, int]:
+def closest_of(first: FloatArray, second: FloatArray) -> tuple[int, int]:
     """How many of the smallest distances, of two readings together, belong to each."""
     both = np.concatenate([first, second])
     if not len(both):
         return 0, 0
-    limit = np.quantile(both, gates.closest)
+    limit = np.quantile(both, GATES.closest)
     return int((first <= limit).sum()), int((second <= limit).sum())

@@ -20,7 +20,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.localization.landmarks import counted_in
 from groma.localization.map_index import MapIndex
 from groma.localization.pose.camera import QueryCamera
-from groma.localization.pose.gates import VERDICT, VerdictGates
+from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.refinement import Refined
 from groma.scene import Scene
@@ -75,7 +75,6 @@ def shown_of(
     matches: Matches,
     found: IntArray,
     lines: bool = True,
-    gates: VerdictGates = VERDICT,
 ) -> tuple[tuple[float, float], float]:
     """Return how many parts of an image show what a pose puts there and how many show none of it; and how often what
     only this place has is found, as a share of how often all of it is.
@@ -92,10 +91,8 @@ def shown_of(
         The pose, what was looked for under it, and the points of the index that agree and are described alike.
     lines
         Whether lines were looked for.
-    gates
-        Size of the parts.
     """
-    camera, side = best.camera, max(best.camera.width, best.camera.height) / gates.parts
+    camera, side = best.camera, max(best.camera.width, best.camera.height) / VERDICT.parts
     ends = matches.segments2d[best.line_inliers]
     shown = np.concatenate([matches.points2d[best.point_inliers], _along(ends, _PIECES)[0]])
     point, times = _seen_by(index, near)
@@ -103,13 +100,13 @@ def shown_of(
     inside = camera.inside(pixel)
     point, pixel, kind = point[inside], pixel[inside], index.unique[point[inside]]
     rate = again.rate[kind.astype(np.int64), times[inside]]
-    expected = [(pixel, rate, gates.expected)]
+    expected = [(pixel, rate, VERDICT.expected)]
     if lines and scene.num_lines:
         rows = np.concatenate([np.arange(int(index.segment_begin[i]), int(index.segment_begin[i + 1])) for i in near])
         known = np.unique(scene.line_observations.line_idx[index.segment[rows]])
         expected.append((*_lengths(camera, best.pose, scene.lines.segments[known]), 0.5 * side))
-    often = _often_alone(rate, np.isin(point, found), kind, gates.expected)
-    return _counted(camera, expected, shown, gates.parts), often
+    often = _often_alone(rate, np.isin(point, found), kind, VERDICT.expected)
+    return _counted(camera, expected, shown, VERDICT.parts), often
 
 
 def _often_alone(rate: FloatArray, found: BoolArray, unique: BoolArray, least: float) -> float:

@@ -76,32 +76,30 @@ class DescribedImage:
         return replace(self, points=points)
 
 
-def find_points(image: GrayImage, gates: FeatureGates = FEATURES) -> DescribedPoints:
+def find_points(image: GrayImage) -> DescribedPoints:
     """Find and describe blobs of any scale and direction."""
-    sift = cv2.SIFT_create(gates.max_points, contrastThreshold=gates.contrast)  # type: ignore[attr-defined]
+    sift = cv2.SIFT_create(FEATURES.max_points, contrastThreshold=FEATURES.contrast)  # type: ignore[attr-defined]
     found, described = sift.detectAndCompute(image, None)
-    return _described(found, described, False, gates)
+    return _described(found, described, False)
 
 
-def find_corners(image: GrayImage, gates: FeatureGates = FEATURES) -> DescribedPoints:
+def find_corners(image: GrayImage) -> DescribedPoints:
     """Find and describe corners, at one scale and upright: maps of sequences consist of such."""
-    found = cv2.goodFeaturesToTrack(image, gates.max_corners, 0.005, gates.corner_distance)
+    found = cv2.goodFeaturesToTrack(image, FEATURES.max_corners, 0.005, FEATURES.corner_distance)
     if found is None:
         return DescribedPoints.empty()
-    return describe_places(image, found.reshape(-1, 2).astype(np.float64) + 0.5, gates)[0]
+    return describe_places(image, found.reshape(-1, 2).astype(np.float64) + 0.5)[0]
 
 
-def describe_places(
-    image: GrayImage, pixels: FloatArray, gates: FeatureGates = FEATURES
-) -> tuple[DescribedPoints, IntArray]:
+def describe_places(image: GrayImage, pixels: FloatArray) -> tuple[DescribedPoints, IntArray]:
     """Describe given places (n, 2), upright; those at the border are left out: also return the rows that are left."""
-    size = 2.0 * gates.corner_scale
+    size = 2.0 * FEATURES.corner_scale
     places = [cv2.KeyPoint(float(u) - 0.5, float(v) - 0.5, size, 0.0, 1.0, 0, row) for row, (u, v) in enumerate(pixels)]
     kept, described = cv2.SIFT_create().compute(image, places)  # type: ignore[attr-defined]
-    return _described(kept, described, True, gates), np.array([one.class_id for one in kept], np.int64)
+    return _described(kept, described, True), np.array([one.class_id for one in kept], np.int64)
 
 
-def _described(found, described, upright: bool, gates: FeatureGates) -> DescribedPoints:
+def _described(found, described, upright: bool) -> DescribedPoints:
     if described is None or not len(found):
         return DescribedPoints.empty()
     pixels = np.array([one.pt for one in found], np.float64) + 0.5
@@ -109,7 +107,7 @@ def _described(found, described, upright: bool, gates: FeatureGates) -> Describe
     root = np.sqrt(described / np.maximum(described.sum(axis=1, keepdims=True), 1e-9))
     octets = np.minimum(np.round(_LENGTH * root), 255.0).astype(np.uint8)
     return DescribedPoints(
-        pixels, np.maximum(gates.sigma * scale, gates.min_sigma), octets, np.full(len(found), upright)
+        pixels, np.maximum(FEATURES.sigma * scale, FEATURES.min_sigma), octets, np.full(len(found), upright)
     )
 
 

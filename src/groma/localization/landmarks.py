@@ -80,11 +80,11 @@ class DescribedLandmarks:
         return np.concatenate(found)
 
 
-def coarsest(points: DescribedPoints, gates: LandmarkGates = GATES) -> IntArray:
+def coarsest(points: DescribedPoints) -> IntArray:
     """Return the points of a query that are matched first; corners are in the order of their strength."""
     blobs, corners = np.flatnonzero(~points.upright), np.flatnonzero(points.upright)
     order = np.argsort(-points.sigma[blobs], kind="stable")
-    return np.concatenate([blobs[order[: gates.points]], corners[: gates.corners]])
+    return np.concatenate([blobs[order[: GATES.points]], corners[: GATES.corners]])
 
 
 def seen_in(index: MapIndex, images: IntArray, gates: LandmarkGates = GATES) -> IntArray:

@@ -108,7 +108,6 @@ def lines_near(
     segments: Segments,
     descriptors: Descriptors,
     reach: float,
-    gates: GuidedLineGates = GATES,
 ) -> IntArray:
     """Return pairs (n, 2) of lines and segments that are near each other under a pose, and look alike.
 
@@ -122,8 +121,6 @@ def lines_near(
         Of the image.
     reach
         Largest distance of a segment's ends from the image of the line, pixels.
-    gates
-        Numbers of the search.
     """
     if not len(segments) or not len(seen.ends) or not len(seen.owner):
         return np.zeros((0, 2), np.int64)
@@ -134,28 +131,26 @@ def lines_near(
     low, high = np.nanmin(straight, axis=(0, 1)) - reach, np.nanmax(straight, axis=(0, 1)) + reach
     touches = (projected.max(axis=1) >= low) & (projected.min(axis=1) <= high)
     chosen = np.flatnonzero(visible & touches.all(axis=1))
-    rows, columns = _pairs_near(np.ascontiguousarray(projected[chosen]), straight, reach, gates)
+    rows, columns = _pairs_near(np.ascontiguousarray(projected[chosen]), straight, reach)
     order = np.argsort(seen.owner, kind="stable")
     begin = np.searchsorted(seen.owner[order], np.arange(len(seen.ends) + 1))
     product = np.empty(len(rows), np.float32)
     of_lines, of_segments = (np.ascontiguousarray(x, np.float32) for x in (seen.descriptors[order], descriptors))
     _most_alike(chosen[rows], columns, begin, of_lines, of_segments, product)
-    alike = np.sqrt(np.maximum(2.0 - 2.0 * product.astype(np.float64), 0.0)) <= gates.descriptor
+    alike = np.sqrt(np.maximum(2.0 - 2.0 * product.astype(np.float64), 0.0)) <= GATES.descriptor
     return np.column_stack([chosen[rows[alike]], columns[alike]])
 
 
-def _pairs_near(
-    lines: FloatArray, segments: FloatArray, reach: float, gates: GuidedLineGates
-) -> tuple[IntArray, IntArray]:
+def _pairs_near(lines: FloatArray, segments: FloatArray, reach: float) -> tuple[IntArray, IntArray]:
     middle = segments.mean(axis=1).T
     order = np.argsort(middle, axis=1, kind="stable")
     middle = np.take_along_axis(middle, order, axis=1)
     longest = float(np.nanmax(np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)))
-    beyond = max(0.5 - gates.overlap, 0.0) * longest
+    beyond = max(0.5 - GATES.overlap, 0.0) * longest
     count = 4 * len(segments)
     while True:
         rows, columns = np.empty((2, count), np.int64)
-        found = _near(lines, segments, order, middle, beyond, reach, gates.angle, gates.overlap, rows, columns)
+        found = _near(lines, segments, order, middle, beyond, reach, GATES.angle, GATES.overlap, rows, columns)
         if found <= count:
             return rows[:found], columns[:found]
         count = found

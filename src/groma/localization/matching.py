@@ -126,7 +126,7 @@ def _near(
 
 
 # ----------------------------------------------------------------------------------------------------------- Public
-def match_descriptors(first: Vectors, second: Vectors, gates: MatchGates = MATCHES) -> IntArray:
+def match_descriptors(first: Vectors, second: Vectors) -> IntArray:
     """Return pairs (m, 2) of rows of two sets of descriptors of length one."""
     if len(first) < 2 or len(second) < 2:
         return np.zeros((0, 2), np.int64)
@@ -140,7 +140,7 @@ def match_descriptors(first: Vectors, second: Vectors, gates: MatchGates = MATCH
 
     map_ranges(compare, len(first), _ROWS)
     far, farther = _distance(top), _distance(next_best)
-    rows = np.flatnonzero((far <= gates.distance) & (far <= gates.ratio * farther))
+    rows = np.flatnonzero((far <= MATCHES.distance) & (far <= MATCHES.ratio * farther))
     columns, which = np.unique(best[rows], return_inverse=True)
     mutual = (first @ second[columns].T).argmax(axis=0)[which.ravel()] == rows if len(rows) else rows == 0
     return np.column_stack([rows[mutual], best[rows[mutual]]])
@@ -172,7 +172,6 @@ def pairs_near(
     pixels: FloatArray,
     second: Bytes,
     reach: float,
-    gates: MatchGates = MATCHES,
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """Pairs of descriptors that are alike, of places that are expected near pixels of an image.
 
@@ -186,8 +185,6 @@ def pairs_near(
         Of the image.
     reach
         Distance that is near, pixels.
-    gates
-        Which descriptors are alike.
 
     Returns
     -------
@@ -201,7 +198,7 @@ def pairs_near(
     number = cell[:, 1] * cells[0] + cell[:, 0]
     order = np.argsort(number, kind="stable")
     begin = np.concatenate([[0], np.cumsum(np.bincount(number, minlength=int(cells[0] * cells[1])))])
-    least, room = 1.0 - 0.5 * gates.distance**2, 4 * len(here)
+    least, room = 1.0 - 0.5 * MATCHES.distance**2, 4 * len(here)
     while True:
         rows, columns, far = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room)
         count = _near(

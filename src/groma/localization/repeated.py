@@ -49,9 +49,7 @@ class Described(NamedTuple):
         return Described(self.point[rows], self.pixel[rows], self.descriptor[rows], self.upright[rows])
 
 
-def unique_points(
-    described: Described, begin: IntArray, sides: FloatArray, count: int, gates: RepeatedGates = GATES
-) -> BoolArray:
+def unique_points(described: Described, begin: IntArray, sides: FloatArray, count: int) -> BoolArray:
     """Return which of ``count`` points look like no other place.
 
     Parameters
@@ -62,20 +60,18 @@ def unique_points(
         Longer sides of the images, pixels.
     count
         Number of points.
-    gates
-        What is alike.
     """
-    work = [(described.part(slice(begin[i], begin[i + 1])), float(side) / gates.cells) for i, side in enumerate(sides)]
+    work = [(described.part(slice(begin[i], begin[i + 1])), float(side) / GATES.cells) for i, side in enumerate(sides)]
     nearest = np.full(count, np.inf)
     np.minimum.at(nearest, described.point, np.concatenate([np.zeros(0), *map_work(_alike_elsewhere, work)]))
     found = np.zeros(count, bool)
-    for upright, limit in zip((False, True), alike_limits(described, gates), strict=True):
+    for upright, limit in zip((False, True), alike_limits(described), strict=True):
         points = described.point[described.upright == upright]
         found[points] = nearest[points] > limit
     return found
 
 
-def alike_limits(described: Described, gates: RepeatedGates = GATES) -> FloatArray:
+def alike_limits(described: Described) -> FloatArray:
     """Return (2,) how far descriptors of one point in two images are from each other: of turned ones, of upright ones.
 
     Parameters are those of :func:`unique_points`.
@@ -86,9 +82,9 @@ def alike_limits(described: Described, gates: RepeatedGates = GATES) -> FloatArr
         rows = rows[np.argsort(described.point[rows], kind="stable")]
         same = np.flatnonzero(np.diff(described.point[rows]) == 0)
         if len(same):
-            same = same[:: max(len(same) // gates.sample, 1)]
+            same = same[:: max(len(same) // GATES.sample, 1)]
             first, second = (unit(described.descriptor[rows[same + step]]) for step in (0, 1))
-            limits[int(upright)] = np.quantile(np.linalg.norm(first - second, axis=1), gates.alike)
+            limits[int(upright)] = np.quantile(np.linalg.norm(first - second, axis=1), GATES.alike)
     return limits
 
 

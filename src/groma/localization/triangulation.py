@@ -68,7 +68,6 @@ def triangulate_features(
     features: Sequence[DescribedPoints],
     pairs: IntArray,
     say: Callable[[int, int], None],
-    gates: TriangulationGates = GATES,
 ) -> PointMap:
     """Match the features of pairs (n, 2) of images, and triangulate them.
 
@@ -81,14 +80,14 @@ def triangulate_features(
     for done, (i, j) in enumerate(pairs):
         say(done, len(pairs))
         found = match_descriptors(vectors[i], vectors[j])
-        near = _in_beam(scene, straight, features, (int(i), int(j)), found, gates.beam)
+        near = _in_beam(scene, straight, features, (int(i), int(j)), found, GATES.beam)
         edges.append(found[near] + begin[[i, j]])
     track = _tracks(np.concatenate(edges), np.repeat(np.arange(len(features)), np.diff(begin)))
     row = np.flatnonzero(track >= 0)
     image = np.repeat(np.arange(len(features)), np.diff(begin))[row]
     pixels, sigma = (np.concatenate([getattr(one, name) for one in features])[row] for name in ("pixels", "sigma"))
     seen = _Observed(row, image, track[row], pixels, sigma)
-    return _points(scene, seen, np.concatenate(straight)[row], len(track), gates)
+    return _points(scene, seen, np.concatenate(straight)[row], len(track))
 
 
 def _straight(scene: Scene, image: int, features: DescribedPoints) -> FloatArray:
@@ -143,7 +142,7 @@ class _Observed(Rows):
     sigma: FloatArray = column()
 
 
-def _points(scene: Scene, seen: _Observed, straight: FloatArray, count: int, gates: TriangulationGates) -> PointMap:
+def _points(scene: Scene, seen: _Observed, straight: FloatArray, count: int) -> PointMap:
     """Points of tracks: nearest to their rays, then refined, twice, each time without what does not agree."""
     xyz = _nearest_to_rays(scene, seen, straight)
     covariance, scale = np.zeros((len(xyz), 3, 3)), 1.0
@@ -164,9 +163,9 @@ def _points(scene: Scene, seen: _Observed, straight: FloatArray, count: int, gat
         squares[order] = residual_squares(problem, "points", len(order))
         scale = noise_of(squares) ** 2
         covariance = landmark_covariances(problem, "points", len(xyz)) * scale
-        agrees = (squares > 0.0) & (squares <= chi_square_gate(gates.outlier, 2) * scale)
+        agrees = (squares > 0.0) & (squares <= chi_square_gate(GATES.outlier, 2) * scale)
         seen = seen.take(agrees)
-    return replace(_well_determined(scene, seen, xyz, covariance, count, gates), noise=float(np.sqrt(scale)))
+    return replace(_well_determined(scene, seen, xyz, covariance, count), noise=float(np.sqrt(scale)))
 
 
 def _nearest_to_rays(scene: Scene, seen: _Observed, straight: FloatArray) -> FloatArray:
@@ -189,15 +188,13 @@ def _nearest_to_rays(scene: Scene, seen: _Observed, straight: FloatArray) -> Flo
     return xyz
 
 
-def _well_determined(
-    scene: Scene, seen: _Observed, xyz: FloatArray, covariance: FloatArray, count: int, gates: TriangulationGates
-) -> PointMap:
+def _well_determined(scene: Scene, seen: _Observed, xyz: FloatArray, covariance: FloatArray, count: int) -> PointMap:
     away = xyz[seen.track] - scene.cam_centers_in_world[seen.image]
     distance = np.full(len(xyz), np.inf)
     np.minimum.at(distance, seen.track, np.linalg.norm(away, axis=1))
     often = np.bincount(seen.track, minlength=len(xyz)) > 1
     with np.errstate(invalid="ignore"):
-        good = often & (np.sqrt(np.trace(covariance, axis1=1, axis2=2)) <= gates.depth * distance)
+        good = often & (np.sqrt(np.trace(covariance, axis1=1, axis2=2)) <= GATES.depth * distance)
     number = np.where(good, np.cumsum(good) - 1, -1)
     point = np.full(count, -1)
     point[seen.row] = number[seen.track]

@@ -75,9 +75,9 @@ class MergedModel:
         """The first map."""
         return self.maps[0]
 
-    def with_lines(self, scene: Scene, gates: MergeGates = GATES) -> Scene:
+    def with_lines(self, scene: Scene) -> Scene:
         """Return what was mapped of the model, with lines of both maps that were not found anew."""
-        return with_lines_of(scene, self.maps, self.names, self.same_lines, gates.same_line)
+        return with_lines_of(scene, self.maps, self.names, self.same_lines, GATES.same_line)
 
     def sentence(self) -> str:
         """Say how the maps were joined."""
@@ -91,9 +91,7 @@ class MergedModel:
         )
 
 
-def merged_model(
-    first: Localizer, second: Localizer, folder: Path, kind: Kind, say: Progress, gates: MergeGates = GATES
-) -> MergedModel:
+def merged_model(first: Localizer, second: Localizer, folder: Path, kind: Kind, say: Progress) -> MergedModel:
     """Return the model of the photographs of two maps.
 
     Parameters
@@ -112,9 +110,9 @@ def merged_model(
     InputError
         If the maps share no place that is recognised, or what they share does not determine the motion.
     """
-    found = _found(first, second, say, gates)
-    matches, same_lines = _matches(first, second, found, gates)
-    motion = _motion(matches, kind, gates)
+    found = _found(first, second, say)
+    matches, same_lines = _matches(first, second, found)
+    motion = _motion(matches, kind)
     moved = second.scene.transformed(Similarity.from_array(motion.similarity))
     poses = {image: _pose_of(moved, image, one) for image, one in found.items()}
     known = {_digest(path): row for row, path in enumerate(first.files)}
@@ -133,11 +131,11 @@ def merged_model(
     )  # fmt: skip
 
 
-def _motion(matches: LandmarkMatches, kind: Kind, gates: MergeGates) -> Motion:
+def _motion(matches: LandmarkMatches, kind: Kind) -> Motion:
     """The motion by the least noise at which half of the matches agree; else that with which most do."""
     best, refused = None, None
-    for step in range(gates.doublings):
-        factor = gates.growth**step
+    for step in range(GATES.doublings):
+        factor = GATES.growth**step
         noisier = (matches.line_sigma * factor, matches.point_sigma * factor)
         noisy = LandmarkMatches.of(
             matches.lines_in_a, matches.lines_in_b, matches.points_in_a, matches.points_in_b, noisier
@@ -157,10 +155,10 @@ def _motion(matches: LandmarkMatches, kind: Kind, gates: MergeGates) -> Motion:
     return best[1]
 
 
-def _found(first: Localizer, second: Localizer, say: Progress, gates: MergeGates) -> dict[int, LocalizedImage]:
+def _found(first: Localizer, second: Localizer, say: Progress) -> dict[int, LocalizedImage]:
     """Photographs of the second map that are found in the first, by their number."""
     count = second.scene.num_images
-    chosen = np.unique(np.linspace(0, count - 1, min(count, gates.photographs)).astype(int))
+    chosen = np.unique(np.linspace(0, count - 1, min(count, GATES.photographs)).astype(int))
     out, sentence = {}, ""
     for done, image in enumerate(chosen.tolist()):
         say("looking for photographs of the second map in the first", done, len(chosen))
@@ -174,14 +172,12 @@ def _found(first: Localizer, second: Localizer, say: Progress, gates: MergeGates
     return out
 
 
-def _matches(
-    first: Localizer, second: Localizer, found: dict[int, LocalizedImage], gates: MergeGates
-) -> tuple[LandmarkMatches, IntArray]:
+def _matches(first: Localizer, second: Localizer, found: dict[int, LocalizedImage]) -> tuple[LandmarkMatches, IntArray]:
     """Points and lines of the second map (a) and of the first (b) that are the same; and rows of the lines."""
     points, lines = Counter[tuple[int, int]](), Counter[tuple[int, int]]()
     for image, one in found.items():
-        points.update(map(tuple, _same_points(second, image, one, gates).tolist()))
-        lines.update(map(tuple, _same_lines(second, image, one, gates).tolist()))
+        points.update(map(tuple, _same_points(second, image, one).tolist()))
+        lines.update(map(tuple, _same_lines(second, image, one).tolist()))
     pairs, line_pairs = _one_to_one(points), _one_to_one(lines)
     a, b = second.index, first.index
     of_points = np.column_stack(
@@ -201,14 +197,14 @@ def _matches(
     return matches, line_pairs[sure]
 
 
-def _same_points(second: Localizer, image: int, found: LocalizedImage, gates: MergeGates) -> IntArray:
+def _same_points(second: Localizer, image: int, found: LocalizedImage) -> IntArray:
     """Pairs (n, 2) of points of the second map and of the first that one photograph shows at one place."""
     index = second.index
     rows = np.arange(int(index.begin[image]), int(index.begin[image + 1]))
     pixels = found.pose.matches.points2d[found.pose.point_inliers]
     if not len(rows) or not len(pixels):
         return np.zeros((0, 2), np.int64)
-    near = KDTree(index.pixel[rows]).query(pixels, distance_upper_bound=gates.same_place)
+    near = KDTree(index.pixel[rows]).query(pixels, distance_upper_bound=GATES.same_place)
     distance, nearest = np.asarray(near[0]), np.asarray(near[1])
     hit = np.flatnonzero(np.isfinite(distance))
     return np.column_stack(
@@ -216,7 +212,7 @@ def _same_points(second: Localizer, image: int, found: LocalizedImage, gates: Me
     )
 
 
-def _same_lines(second: Localizer, image: int, found: LocalizedImage, gates: MergeGates) -> IntArray:
+def _same_lines(second: Localizer, image: int, found: LocalizedImage) -> IntArray:
     """Pairs (n, 2) of lines of the second map and of the first of which one photograph shows one segment."""
     seen = second.scene.line_observations
     rows = np.flatnonzero(seen.image_idx == image)
@@ -226,7 +222,7 @@ def _same_lines(second: Localizer, image: int, found: LocalizedImage, gates: Mer
         return np.zeros((0, 2), np.int64)
     off = segments_apart(query.reshape(-1, 4), seen.segment[rows])
     nearest = off.argmin(axis=1)
-    hit = np.flatnonzero(off[np.arange(len(query)), nearest] < gates.same_line)
+    hit = np.flatnonzero(off[np.arange(len(query)), nearest] < GATES.same_line)
     return np.column_stack([seen.line_idx[rows[nearest[hit]]], found.line[inliers[hit]]])
 
 

@@ -17,7 +17,7 @@ from groma._typing import BoolArray, FloatArray
 from groma.gates import chi_square_gate
 from groma.geometry import quaternion
 from groma.localization.pose.camera import QueryCamera
-from groma.localization.pose.gates import HYPOTHESES, HypothesisGates
+from groma.localization.pose.gates import HYPOTHESES
 from groma.localization.pose.matches import Matches
 
 
@@ -51,9 +51,9 @@ def straightened(camera: QueryCamera, matches: Matches) -> Straight:
     return Straight(pinhole, moved, good, good_lines)
 
 
-def max_errors(matches: Matches, gates: HypothesisGates = HYPOTHESES) -> tuple[float, float]:
+def max_errors(matches: Matches) -> tuple[float, float]:
     """Return how far points, and ends of segments from their lines, may lie from where a proposed pose puts them."""
-    factor = gates.slack * float(np.sqrt(chi_square_gate(gates.outlier, 2)))
+    factor = HYPOTHESES.slack * float(np.sqrt(chi_square_gate(HYPOTHESES.outlier, 2)))
     sigmas = (matches.point_sigma, matches.segment_sigma)
     points, lines = (factor * float(np.median(sigma)) if len(sigma) else factor for sigma in sigmas)
     return points, lines
@@ -65,7 +65,6 @@ def propose(
     seed: int,
     share: float = 0.0,
     least: int = 0,
-    gates: HypothesisGates = HYPOTHESES,
 ) -> FloatArray | None:
     """Return the pose (7,) cam_from_world that most matches agree with; None without one.
 
@@ -81,17 +80,16 @@ def propose(
         A pose that a smaller share of the matches agrees with is of no interest, and need not be found.
     least
         Nor is one that fewer matches agree with.
-    gates
-        Numbers of the search.
     """
     import poselib
 
     matches = straight.matches
-    if matches.num_points + matches.num_lines < gates.min_matches:
+    if matches.num_points + matches.num_lines < HYPOTHESES.min_matches:
         return None
     settings = {
         "max_reproj_error": errors[0], "max_epipolar_error": errors[1], "seed": seed,
-        "success_prob": gates.confidence, "min_iterations": gates.min_trials, "max_iterations": _trials(share, gates),
+        "success_prob": HYPOTHESES.confidence, "min_iterations": HYPOTHESES.min_trials,
+        "max_iterations": _trials(share),
     }  # fmt: skip
     ends, lines = matches.segments2d, matches.segments3d
     if matches.num_lines:
@@ -103,7 +101,7 @@ def propose(
         found, report = poselib.estimate_absolute_pose(
             matches.points2d, matches.points3d, straight.camera, settings, {}
         )
-    if report["num_inliers"] < max(gates.min_matches, least) or not np.isfinite(found.Rt).all():
+    if report["num_inliers"] < max(HYPOTHESES.min_matches, least) or not np.isfinite(found.Rt).all():
         return None
     # The last digits depend on where arrays lie in memory; they are cut off, so that a seed gives one result.
     rotation = quaternion.from_matrix(np.asarray(found.R, np.float64)[None])[0].astype(np.float32).astype(np.float64)
@@ -111,11 +109,11 @@ def propose(
     return np.concatenate([rotation / np.linalg.norm(rotation), shift])
 
 
-def _trials(share: float, gates: HypothesisGates) -> int:
+def _trials(share: float) -> int:
     """How many samples of three hold one without outliers, if so many matches are none; three times as many, since
     noise spoils some.
     """
     if share <= 0.0:
-        return gates.max_trials
-    wanted = 3.0 * np.log1p(-gates.confidence) / np.log1p(-(min(share, 0.99) ** 3))
-    return int(np.clip(wanted, gates.min_trials, gates.max_trials))
+        return HYPOTHESES.max_trials
+    wanted = 3.0 * np.log1p(-HYPOTHESES.confidence) / np.log1p(-(min(share, 0.99) ** 3))
+    return int(np.clip(wanted, HYPOTHESES.min_trials, HYPOTHESES.max_trials))

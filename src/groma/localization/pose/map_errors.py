@@ -56,9 +56,9 @@ class SeenByImage:
     pose: FloatArray
 
 
-def images_compared(count: int, gates: MapErrorGates = GATES) -> IntArray:
+def images_compared(count: int) -> IntArray:
     """Return which of so many images are compared with the rest of their map."""
-    return np.unique(np.round(np.linspace(0, count - 1, gates.images)).astype(np.int64))
+    return np.unique(np.round(np.linspace(0, count - 1, GATES.images)).astype(np.int64))
 
 
 def shared_errors(
@@ -84,10 +84,10 @@ def _compared(image: SeenByImage) -> tuple[_Case | None, _Case | None]:
     return _case(replace(image, matches=points)), _case(replace(image, matches=matches))
 
 
-def _case(image: SeenByImage, gates: MapErrorGates = GATES) -> _Case | None:
+def _case(image: SeenByImage) -> _Case | None:
     """Difference of two poses of an image, and its covariances by noise and by a shared error of one radian."""
     matches = image.matches
-    if matches.num_points + matches.num_lines < gates.matches:
+    if matches.num_points + matches.num_lines < GATES.matches:
         return None
     found = refine(image.camera, matches, image.pose, max_errors(matches))
     noise = found.noise_covariance(matches)

@@ -11,12 +11,12 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from groma._typing import FloatArray
-from groma.localization.pose.gates import VERDICT, VerdictGates
+from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.refinement import Refined, cells_of
 
 
-def cells_elsewhere(refined: Refined, matches: Matches, beyond: float, gates: VerdictGates = VERDICT) -> int:
+def cells_elsewhere(refined: Refined, matches: Matches, beyond: float) -> int:
     """Return how many cells of an image show the map elsewhere than a pose says, each like a cell beside it.
 
     Parameters
@@ -25,11 +25,9 @@ def cells_elsewhere(refined: Refined, matches: Matches, beyond: float, gates: Ve
         The pose, and all that may be seen.
     beyond
         Matches that are off by less, pixels, do not disagree for sure.
-    gates
-        Size of the cells; how far neighbours reach, and how much they may differ.
     """
     camera = refined.camera
-    cell = cells_of(matches.points2d, camera, gates.cells)
+    cell = cells_of(matches.points2d, camera, VERDICT.cells)
     expected = camera.project(refined.pose, matches.points3d)
     off = matches.points2d - expected
     agreeing = np.unique(cell[refined.point_inliers])
@@ -39,9 +37,9 @@ def cells_elsewhere(refined: Refined, matches: Matches, beyond: float, gates: Ve
         return 0
     side = max(camera.width, camera.height)
     pixels, cell, off = matches.points2d[rows], cell[rows], off[rows]
-    first, second = KDTree(pixels).query_pairs(gates.beside * side, output_type="ndarray").T
+    first, second = KDTree(pixels).query_pairs(VERDICT.beside * side, output_type="ndarray").T
     alike = (cell[first] != cell[second]) & (
-        _length(off[first] - off[second]) <= gates.bend * _length(pixels[first] - pixels[second])
+        _length(off[first] - off[second]) <= VERDICT.bend * _length(pixels[first] - pixels[second])
     )
     return len(np.unique(cell[np.concatenate([first[alike], second[alike]])]))
 

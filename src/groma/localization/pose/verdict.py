@@ -70,12 +70,12 @@ class Verdict:
     sentence: str
 
 
-def evidence_of(refined: Refined, matches: Matches, places: int = 1, gates: VerdictGates = VERDICT) -> Evidence:
+def evidence_of(refined: Refined, matches: Matches, places: int = 1) -> Evidence:
     """Return the evidence for a pose that was looked for in so many places."""
     camera = refined.camera
     by_chance = np.minimum(math.pi * refined.limit * refined.points.spread / camera.area, 0.5)
-    agree, chance = _by_cell(matches.points2d, refined.point_inliers, by_chance, camera, gates.cells)
-    reach = (gates.search_share * max(camera.width, camera.height)) ** 2
+    agree, chance = _by_cell(matches.points2d, refined.point_inliers, by_chance, camera, VERDICT.cells)
+    reach = (VERDICT.search_share * max(camera.width, camera.height)) ** 2
     by_chance = np.minimum(math.pi * refined.limit * refined.lines.spread / reach, 0.5)
     line = np.unique(matches.segments3d.reshape(-1, 6), axis=0, return_inverse=True)[1].ravel()
     line_agree, line_chance = _joined(line, refined.line_inliers, by_chance)
@@ -95,7 +95,6 @@ def judge(
     distance: float,
     first: Evidence,
     second: Evidence | None,
-    gates: VerdictGates = VERDICT,
 ) -> Verdict:
     """Say whether a pose is right.
 
@@ -107,8 +106,6 @@ def judge(
         Median distance of the landmarks that agree.
     first, second
         Evidence for it, and for another place.
-    gates
-        Numbers of the decision.
     """
     chance = 1.0 / (1.0 + math.exp(min(first.log_alarms, 700.0)))
     rival = _as_good(first, second)
@@ -116,25 +113,27 @@ def judge(
     agree = f"{counted(int(refined.point_inliers.sum()), 'points')} and " + counted(
         int(refined.line_inliers.sum()), "lines"
     )
-    if chance < gates.chance:
+    if chance < VERDICT.chance:
         return Verdict(
             "failed", probability, f"No pose: only {agree} agree with the best one, as may happen by chance."
         )
-    if rival > 1.0 - gates.right and second is not None:
+    if rival > 1.0 - VERDICT.right and second is not None:
         return Verdict(
             "uncertain",
             probability,
             f"Two places fit about equally well: {first.agree} measurements speak for this one, {second.agree} for "
             "another. They may look alike.",
         )
-    if probability < gates.right:
+    if probability < VERDICT.right:
         return Verdict(
             "uncertain",
             probability,
             f"{agree} agree, which may happen by chance once in {1 / max(1 - chance, 1e-9):.0f}.",
         )
     sigma = np.sqrt(np.diag(covariance))
-    if not (np.isfinite(sigma).all() and sigma[3:].max() <= gates.turn and sigma[:3].max() <= gates.center * distance):
+    if not (
+        np.isfinite(sigma).all() and sigma[3:].max() <= VERDICT.turn and sigma[:3].max() <= VERDICT.center * distance
+    ):
         return Verdict("uncertain", probability, f"{agree} agree, but they do not determine the pose: {_open(sigma)}.")
     return Verdict("localized", probability, f"{agree} agree.")
 
@@ -152,15 +151,15 @@ def doubted_if_mirrored(verdict: Verdict, own: int, mirror: int, gates: VerdictG
     return Verdict("uncertain", 1.0 - gates.right, words)
 
 
-def doubted_if_in_pieces(verdict: Verdict, agree: int, elsewhere: int, gates: VerdictGates = VERDICT) -> Verdict:
+def doubted_if_in_pieces(verdict: Verdict, agree: int, elsewhere: int) -> Verdict:
     """Return a verdict, or ``uncertain`` where about as much of the photograph shows the map elsewhere."""
-    if not elsewhere or _tail(elsewhere, agree) <= 1.0 - gates.right:
+    if not elsewhere or _tail(elsewhere, agree) <= 1.0 - VERDICT.right:
         return verdict
     words = (
         f"{agree} measurements speak for this place, and {elsewhere} cells of the image show the map where this place "
         "does not have it: it may repeat itself, or be put together of pieces."
     )
-    return Verdict("uncertain", 1.0 - gates.right, words)
+    return Verdict("uncertain", 1.0 - VERDICT.right, words)
 
 
 def doubted_if_missing(verdict: Verdict, shown: float, missing: float, gates: VerdictGates = VERDICT) -> Verdict:
@@ -181,22 +180,22 @@ def doubted_if_missing(verdict: Verdict, shown: float, missing: float, gates: Ve
     return Verdict("uncertain", 1.0 - gates.right, words)
 
 
-def doubted_if_repeated(verdict: Verdict, often: float, gates: VerdictGates = VERDICT) -> Verdict:
+def doubted_if_repeated(verdict: Verdict, often: float) -> Verdict:
     """Return a verdict, or ``uncertain`` where more of what only this place has is missing than is there.
 
     ``often`` is how often points that look like no other are found, as a share of how often all points are: one in this
     place, nothing in another that looks like it.
     """
-    if verdict.status != "localized" or often >= gates.alone:
+    if verdict.status != "localized" or often >= VERDICT.alone:
         return verdict
     words = (
         f"{verdict.sentence} But points that look like no other place are found {100 * often:.0f} % as often as all: "
         "the photograph may show another place that looks like this one."
     )
-    return Verdict("uncertain", 1.0 - gates.right, words)
+    return Verdict("uncertain", 1.0 - VERDICT.right, words)
 
 
-def doubted_if_other_lens(verdict: Verdict, step: LensStep, gates: VerdictGates = VERDICT) -> Verdict:
+def doubted_if_other_lens(verdict: Verdict, step: LensStep) -> Verdict:
     """Return a verdict, or ``uncertain`` where what agrees asks for a principal point far from the one that was given,
     or for another focal length: a step that is large, also beside its standard deviation.
     """
@@ -204,38 +203,38 @@ def doubted_if_other_lens(verdict: Verdict, step: LensStep, gates: VerdictGates 
 
     if verdict.status != "localized":
         return verdict
-    if step.shift > gates.shift and chdtrc(3.0, step.square) < 1.0 - gates.whole:
+    if step.shift > VERDICT.shift and chdtrc(3.0, step.square) < 1.0 - VERDICT.whole:
         why = (
             "a principal point far from where it should be better: the photograph may be cropped, or put together of "
             "pieces."
         )
-    elif abs(step.focal) > max(gates.focal, gates.focal_noise * step.focal_sigma):
+    elif abs(step.focal) > max(VERDICT.focal, VERDICT.focal_noise * step.focal_sigma):
         why = (
             f"a {'longer' if step.focal > 0.0 else 'shorter'} focal length better: the calibration is not that of this "
             "photograph. Pass its own, or let it be estimated (--calibration unknown)."
         )
     else:
         return verdict
-    return Verdict("uncertain", 1.0 - gates.right, f"{verdict.sentence} But they fit {why}")
+    return Verdict("uncertain", 1.0 - VERDICT.right, f"{verdict.sentence} But they fit {why}")
 
 
-def votes_of_a_rival(agree: int, gates: VerdictGates = VERDICT) -> int:
+def votes_of_a_rival(agree: int) -> int:
     """How many cells must agree with another place for it to make one with so many doubtful."""
     votes = np.arange(agree + 1)
-    return int(np.argmax(_tail(votes, agree) > 1.0 - gates.right))
+    return int(np.argmax(_tail(votes, agree) > 1.0 - VERDICT.right))
 
 
-def votes_of_a_part(votes: int, share: float, gates: VerdictGates = VERDICT) -> int:
+def votes_of_a_part(votes: int, share: float) -> int:
     """How many votes a share of the matches, drawn at random, has at least if all have so many."""
     from scipy.special import bdtr
 
     fewer = np.arange(votes + 1)
-    return int(np.argmax(bdtr(fewer, votes, share) > 1.0 - gates.right))
+    return int(np.argmax(bdtr(fewer, votes, share) > 1.0 - VERDICT.right))
 
 
-def most_votes(matches: Matches, camera: QueryCamera, gates: VerdictGates = VERDICT) -> int:
+def most_votes(matches: Matches, camera: QueryCamera) -> int:
     """How many cells and segments could agree with a pose at most: those that have matches."""
-    cells = cells_of(matches.points2d, camera, gates.cells)
+    cells = cells_of(matches.points2d, camera, VERDICT.cells)
     lines = np.unique(matches.segments3d.reshape(-1, 6), axis=0) if matches.num_lines else ()
     return int(cells.max(initial=-1)) + 1 + len(lines)
 

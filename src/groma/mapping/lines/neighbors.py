@@ -52,9 +52,10 @@ class NeighborGates:
     )
 
 
-def covisible_neighbors(
-    scene: Scene, num_neighbors: int, min_shared: int = 8, gates: NeighborGates = NeighborGates()
-) -> list[IntArray]:
+GATES = NeighborGates()
+
+
+def covisible_neighbors(scene: Scene, num_neighbors: int, min_shared: int = 8) -> list[IntArray]:
     """Choose for every image its neighbours, best first.
 
     Parameters
@@ -65,8 +66,6 @@ def covisible_neighbors(
         At most this many per image.
     min_shared : int
         Shared points below which two images are no neighbours.
-    gates : NeighborGates, optional
-        Which angles are good.
 
     Returns
     -------
@@ -78,9 +77,9 @@ def covisible_neighbors(
     Work and memory grow with the number of pairs of images that share points, not with the square of images.
     """
     if len(scene.point_observations) == 0:
-        return _by_geometry(scene, num_neighbors, gates)
+        return _by_geometry(scene, num_neighbors)
     sees = _sees(scene)
-    shared = _Shared(sees, (sees @ sees.T).tocsr(), scene.points.xyz, scene.cam_centers_in_world, gates)
+    shared = _Shared(sees, (sees @ sees.T).tocsr(), scene.points.xyz, scene.cam_centers_in_world, GATES)
     return map_in_threads(partial(shared.best_of, num=num_neighbors, min_shared=min_shared), range(scene.num_images))
 
 
@@ -141,7 +140,7 @@ def _angles(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.arctan2(cross, np.einsum("...i,...i->...", first, second))
 
 
-def _by_geometry(scene: Scene, num_neighbors: int, gates: NeighborGates) -> list[IntArray]:
+def _by_geometry(scene: Scene, num_neighbors: int) -> list[IntArray]:
     """Neighbours without points: similar viewing direction, near by, not at the same place."""
     poses, centers = scene.cam_from_world, scene.cam_centers_in_world
     axis = quaternion.rotate(quaternion.conjugate(poses[:, :4]), np.broadcast_to([0.0, 0.0, 1.0], (len(poses), 3)))
@@ -150,11 +149,11 @@ def _by_geometry(scene: Scene, num_neighbors: int, gates: NeighborGates) -> list
     def of_image(i: int) -> IntArray:
         distance = np.linalg.norm(centers - centers[i], axis=1)
         turn = _angles(axis, np.broadcast_to(axis[i], axis.shape))
-        usable = (distance > 1e-6 * extent) & (turn < np.deg2rad(gates.max_turn_deg))
+        usable = (distance > 1e-6 * extent) & (turn < np.deg2rad(GATES.max_turn_deg))
         usable[i] = False
         others = np.flatnonzero(usable)
         spread = np.median(np.sort(distance[others])[:num_neighbors]) if len(others) else 1.0
-        cost = turn[others] / np.deg2rad(gates.turn_scale_deg) + distance[others] / spread
+        cost = turn[others] / np.deg2rad(GATES.turn_scale_deg) + distance[others] / spread
         return others[np.argsort(cost, kind="stable")[:num_neighbors]]
 
     return [of_image(i) for i in range(len(poses))]

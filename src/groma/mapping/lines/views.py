@@ -49,6 +49,9 @@ class ViewGates:
     )
 
 
+GATES = ViewGates()
+
+
 @dataclass(frozen=True, eq=False)
 class LineViews:
     """Images and their segments. Rows of image i are ``pointers[i] : pointers[i + 1]``."""
@@ -96,7 +99,6 @@ def build_views(
     min_length: float,
     noise: float,
     depth_margin: float,
-    gates: ViewGates = ViewGates(),
 ) -> LineViews:
     """Undistort the segments of all images and find where to look for them in depth.
 
@@ -112,8 +114,6 @@ def build_views(
         Added in quadrature to the segments' own sigma; pixels.
     depth_margin : float
         Factor by which the depth range of the points near a segment is widened at both sides.
-    gates : ViewGates, optional
-        Which points tell the depth.
     """
     count = scene.num_images
     camera = _cameras(scene)
@@ -126,7 +126,7 @@ def build_views(
         "usable": np.zeros(0, bool), "sigma": np.zeros(0), "range": np.zeros((0, 2)), "inverse_depth": np.zeros((0, 2)),
     }  # fmt: skip
     cameras = scene.keep(points=[], lines=[], planes=[], directions=[])  # points travel with their images
-    parts = [none, *map_work(partial(_columns_of, cameras, (min_length, noise, depth_margin), gates), work)]
+    parts = [none, *map_work(partial(_columns_of, cameras, (min_length, noise, depth_margin), GATES), work)]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in none}
     sizes = [len(item.ends) for item in segments]
     return LineViews(

@@ -42,12 +42,15 @@ class JunctionGates:
     max_samples: int = gate(256, "samples", "of a line", "cost: memory")
 
 
-def meetings(marks: Landmarks, level: float, least: float, gates: JunctionGates = JunctionGates()) -> Pairs:
+GATES = JunctionGates()
+
+
+def meetings(marks: Landmarks, level: float, least: float) -> Pairs:
     """Pairs (first, second) of usable lines that meet, the smaller number first."""
     rows = np.flatnonzero(marks.line_usable)
     if len(rows) < 2:
         return Pairs.none()
-    pairs = rows[_neighbours(marks.segments[rows], marks.line_pixel[rows], gates)]
+    pairs = rows[_neighbours(marks.segments[rows], marks.line_pixel[rows])]
     first, second = pairs.T
     ends = marks.segments
     start = ends[first, 0], ends[second, 0]
@@ -63,14 +66,14 @@ def meetings(marks: Landmarks, level: float, least: float, gates: JunctionGates 
         for own, other in ((along[0], along[1]), (along[1], along[0]))
     )
     pixel = 0.5 * (marks.line_pixel[first] + marks.line_pixel[second])
-    near = (sine > gates.min_sine) & (np.abs(dot(between, normal)) < gates.layer_px * pixel)
+    near = (sine > GATES.min_sine) & (np.abs(dot(between, normal)) < GATES.layer_px * pixel)
     gap = []
     for line, place in ((first, share[0]), (second, share[1])):
         length_px = norm(ends[line, 1] - ends[line, 0]) / marks.line_pixel[line]
         gap.append((np.abs(place - 0.5) - 0.5) * length_px)  # beyond the nearer end, below zero before it
-        near &= marks.intervals.covers(line, np.clip(place, 0.0, 1.0), 1e-9) & (gap[-1] < gates.reach_px)
+        near &= marks.intervals.covers(line, np.clip(place, 0.0, 1.0), 1e-9) & (gap[-1] < GATES.reach_px)
     # Lines that both go on cross in front of each other, or on a surface.
-    kept = np.flatnonzero(near & (np.maximum(*gap) > -gates.reach_px))
+    kept = np.flatnonzero(near & (np.maximum(*gap) > -GATES.reach_px))
     if len(kept) == 0:
         return Pairs.none()
     variance = np.zeros(len(kept))
@@ -78,44 +81,44 @@ def meetings(marks: Landmarks, level: float, least: float, gates: JunctionGates 
         slope = np.einsum("nai,ni->na", marks.own_line_noise.across[line], normal[kept])
         variance += np.einsum("na,nab,nb->n", slope, marks.own_line_noise.at(place, place, line), slope)
     distance = (dot(between, normal) / pixel)[kept]
-    candidates = _candidates(distance, variance / pixel[kept] ** 2, np.column_stack(gap)[kept], gates)
-    told = memberships(candidates, np.array([gates.most_px]))
+    candidates = _candidates(distance, variance / pixel[kept] ** 2, np.column_stack(gap)[kept])
+    told = memberships(candidates, np.array([GATES.most_px]))
     deviation = told.deviation[0]
     passed = distance**2 < chi_square_gate(1.0 - level, 1) * (candidates.variance[:, 0] + deviation**2)
     passed &= told.probability > least
     return Pairs(pairs[kept], told.probability, np.full(len(kept), deviation)).take(passed)
 
 
-def _candidates(distance: FloatArray, variance: FloatArray, gap: FloatArray, gates: JunctionGates) -> Candidates:
+def _candidates(distance: FloatArray, variance: FloatArray, gap: FloatArray) -> Candidates:
     """Distances with their variances (N,) and gaps at the ends (N, 2), all in pixels, as one mixture.
 
     The gap at the end of a line tells something where the line ends; where it goes on it is as likely either way.
     """
-    even = 0.5 / gates.reach_px
-    ending = gap > -gates.reach_px
-    end_variance = np.where(ending, gates.end_px**2, 0.5 / (np.pi * even**2))
+    even = 0.5 / GATES.reach_px
+    ending = gap > -GATES.reach_px
+    end_variance = np.where(ending, GATES.end_px**2, 0.5 / (np.pi * even**2))
     num = len(distance)
     return Candidates(
         owner=np.zeros(num, np.int64),
         offset=np.column_stack([distance, np.where(ending, gap, 0.0)]),
         variance=np.column_stack([variance, end_variance]),
         unit=np.tile([1.0, 0.0, 0.0], (num, 1)),
-        clutter=np.full(num, 0.5 / gates.layer_px * even**2),
+        clutter=np.full(num, 0.5 / GATES.layer_px * even**2),
         counted=np.ones(num, bool),
         group=np.zeros(num, np.int64),
     )
 
 
-def _neighbours(segments: FloatArray, pixel: FloatArray, gates: JunctionGates) -> IntArray:
+def _neighbours(segments: FloatArray, pixel: FloatArray) -> IntArray:
     """Pairs (M, 2) of segments, one of which ends near the other; the smaller number first."""
     length = norm(segments[:, 1] - segments[:, 0])
-    count = np.clip(np.ceil(length / (gates.sample_px * pixel)), 2, gates.max_samples).astype(np.int64)
+    count = np.clip(np.ceil(length / (GATES.sample_px * pixel)), 2, GATES.max_samples).astype(np.int64)
     owner = np.repeat(np.arange(len(segments)), count)
     number = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
     share = number / (count[owner] - 1)
     samples = segments[owner, 0] + share[:, None] * (segments[owner, 1] - segments[owner, 0])
     ends = segments.reshape(-1, 3)
-    nearest = min(gates.nearest, len(samples))
+    nearest = min(GATES.nearest, len(samples))
     _, index = kd_tree(samples).query(ends, k=nearest, workers=num_threads())
     one, other = np.repeat(np.arange(len(ends)) // 2, nearest), owner[index.reshape(len(ends), -1)].ravel()
     different = one != other

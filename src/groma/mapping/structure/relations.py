@@ -54,6 +54,9 @@ class RelationGates:
     )
 
 
+GATES = RelationGates()
+
+
 @dataclass(frozen=True)
 class Landmarks:
     """Points and segments with their noise; only the usable ones take part in relations."""
@@ -108,14 +111,12 @@ class Pairs:
         return Pairs(pairs, self.probability, self.deviation).take(structure >= 0)
 
 
-def spacings(
-    points: FloatArray, segments: FloatArray, gates: RelationGates = RelationGates()
-) -> tuple[FloatArray, FloatArray]:
+def spacings(points: FloatArray, segments: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Distances (P,), (L, 2) from points and segment ends to their neighbours among both."""
     places = np.concatenate([points, segments.reshape(-1, 3)])
     if len(places) < 2:
         return np.ones(len(points)), np.ones((len(segments), 2))
-    distance, _ = kd_tree(places).query(places, k=min(gates.neighbor + 1, len(places)), workers=num_threads())
+    distance, _ = kd_tree(places).query(places, k=min(GATES.neighbor + 1, len(places)), workers=num_threads())
     return distance[: len(points), -1], distance[len(points) :, -1].reshape(-1, 2)
 
 
@@ -124,7 +125,6 @@ def on_planes(
     found: PlaneSet,
     level: float,
     least: tuple[float, float],
-    gates: RelationGates = RelationGates(),
 ) -> tuple[Pairs, Pairs]:
     """Points on planes and lines on planes; their probabilities have to exceed the least of their kind.
 
@@ -134,7 +134,7 @@ def on_planes(
     num = len(found)
     if num == 0:
         return Pairs.none(), Pairs.none()
-    parts = list(zip(*map_in_threads(partial(_near_plane, marks, found, gates.layer), range(num)), strict=True))
+    parts = list(zip(*map_in_threads(partial(_near_plane, marks, found, GATES.layer), range(num)), strict=True))
     points, lines = np.concatenate(parts[0]), np.concatenate(parts[1])
     table = np.concatenate([points, lines])
     mark, owner = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
@@ -142,7 +142,7 @@ def on_planes(
     pixel = np.concatenate([marks.point_pixel[mark[~is_line]], marks.line_pixel[mark[is_line]]])
     label = _label(found.point_label, marks.point_usable), _label(found.segment_label, marks.line_usable)
     label = np.concatenate(label)[mark + len(marks.points) * is_line]
-    half = gates.layer * found.band
+    half = GATES.layer * found.band
     typical = np.array([np.median(pixel[owner == k]) if (owner == k).any() else 1.0 for k in range(num)])
     told = memberships(
         Candidates(
@@ -154,9 +154,9 @@ def on_planes(
             counted=(label < 0) | (label == owner),
             group=owner + num * is_line,
         ),
-        gates.widest * half / typical,
+        GATES.widest * half / typical,
     )
-    competing = np.arccos(np.clip(np.abs(found.planes[:, :3] @ found.planes[:, :3].T), 0.0, 1.0)) < gates.competing
+    competing = np.arccos(np.clip(np.abs(found.planes[:, :3] @ found.planes[:, :3].T), 0.0, 1.0)) < GATES.competing
     results = []
     for rows, dof, enough in ((~is_line, 1, least[0]), (is_line, 2, least[1])):
         deviation = told.deviation[owner[rows]]
@@ -209,18 +209,18 @@ def _near_plane(marks: Landmarks, found: PlaneSet, layer: float, k: int) -> tupl
     return np.column_stack(columns), np.column_stack([lines, np.full(len(lines), k), height, spread, offset, variance])
 
 
-def on_lines(marks: Landmarks, level: float, least: float, gates: RelationGates = RelationGates()) -> Pairs:
+def on_lines(marks: Landmarks, level: float, least: float) -> Pairs:
     """Points on lines: where images support them, not in gaps nor beyond their ends."""
     rows = np.flatnonzero(marks.line_usable)
     tested = np.flatnonzero(marks.point_usable)
     if len(rows) == 0 or len(tested) == 0:
         return Pairs.none()
-    pairs = _near_segments(marks.points[tested], marks.segments[rows], gates)
+    pairs = _near_segments(marks.points[tested], marks.segments[rows])
     point, line = tested[pairs[:, 0]], rows[pairs[:, 1]]
     start, along = marks.segments[line, 0], marks.segments[line, 1] - marks.segments[line, 0]
     share = dot(marks.points[point] - start, along) / dot(along, along)
     offset = marks.points[point] - start - share[:, None] * along
-    inside = marks.intervals.covers(line, share, gates.line_margin)
+    inside = marks.intervals.covers(line, share, GATES.line_margin)
     point, line, share, offset = point[inside], line[inside], share[inside], offset[inside]
     across = marks.line_noise.across[line]
     components = np.einsum("nai,ni->na", across, offset)
@@ -239,7 +239,7 @@ def on_lines(marks: Landmarks, level: float, least: float, gates: RelationGates 
     near = distance < band[line]
     point, line, squared = point[near], line[near], squared[near]
     # On a wall full of points the clutter beside a line is spread over one dimension, not two.
-    probability, _ = inlier_probability(distance[near], spread[near], line, band, gates.pooled)
+    probability, _ = inlier_probability(distance[near], spread[near], line, band, GATES.pooled)
     passed = (squared < largest) & (probability > least)
     return Pairs(np.column_stack([point, line]), probability, np.zeros(len(point))).take(passed)
 
@@ -279,16 +279,16 @@ def _line_heights(
     return (weight * height).sum(axis=1) / information, 1.0 / np.sqrt(information), offset, variance
 
 
-def _near_segments(points: FloatArray, segments: FloatArray, gates: RelationGates) -> IntArray:
+def _near_segments(points: FloatArray, segments: FloatArray) -> IntArray:
     """Pairs (point, segment) of segments near points, found by samples along the segments."""
     length = norm(segments[:, 1] - segments[:, 0])
-    number = max(gates.num_samples[0], gates.num_samples[1] * len(segments))
+    number = max(GATES.num_samples[0], GATES.num_samples[1] * len(segments))
     count = np.clip(np.ceil(number * length / max(length.sum(), 1e-300)), 3, 512).astype(np.int64)
     owner = np.repeat(np.arange(len(segments)), count)
     first = np.repeat(np.cumsum(count) - count, count)
     share = (np.arange(len(owner)) - first) / (count[owner] - 1)
     samples = segments[owner, 0] + share[:, None] * (segments[owner, 1] - segments[owner, 0])
-    nearest = min(gates.num_nearest, len(samples))
+    nearest = min(GATES.num_nearest, len(samples))
     _, index = kd_tree(samples).query(points, k=nearest, workers=num_threads())
     return distinct_pairs(np.repeat(np.arange(len(points)), nearest), owner[index.reshape(len(points), -1)].ravel())[0]
 

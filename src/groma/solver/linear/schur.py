@@ -194,13 +194,11 @@ class ReducedSystem:
         widest = max([c.width for c in layout.kept], default=0)
         tallest = max([e.dof for e in layout.eliminated], default=0)
         self._Y = [np.zeros(widest * tallest) for _ in range(shares)]
-        self._most_pairs = max(
-            (int(i.pair_pointer[-1]) for e in layout.eliminated for i in e.incidences.values()), default=0
-        )
+        self._products = _products(layout)
         kinds = [layout.problem.variables[e.group].manifold.kind for e in layout.eliminated]
         self._landmark_damping = [LANDMARK_DAMPING.get(kind, 1.0) for kind in kinds]
         self._singular = [0] * shares
-        self._steepest = [0.0] * shares
+        self._steepest: list[list[float]] = [[0.0] for _ in range(shares)]
         self.num_singular_landmarks = 0
         #: Of the last steps of the landmarks: the sums of delta D delta, with D as their damping takes it, and g delta.
         self.landmark_squares = self.landmark_slope = 0.0
@@ -211,7 +209,7 @@ class ReducedSystem:
         for gradients in self._g:
             for g in gradients:
                 g[:] = 0.0
-        self._singular, self._steepest = [0] * len(self._g), [0.0] * len(self._g)
+        self._singular, self._steepest = [0] * len(self._g), [[0.0] for _ in self._g]
 
     def eliminate_chunk(self, share: int, chunk: Chunk, damping: float) -> None:
         """Eliminate the landmarks of one chunk of a share, whose chunks follow in their order.
@@ -221,28 +219,24 @@ class ReducedSystem:
         e = chunk.eliminated
         if e is None:
             return
-        eliminated, equations = self.layout.eliminated[e], self.equations
-        dof, N, h, S = width(eliminated.dof), self.N[e], self.h[e], self._sums.of(share)
+        equations, (dof, squares, crosses) = self.equations, self._products[e]
+        N, h, S, Y = self.N[e], self.h[e], self._sums.of(share), self._Y[share]
         own = np.array([damping * self._landmark_damping[e]])
         singular, steepest = invert_blocks(
             equations.V[e], equations.g_landmarks[e], own, 0, chunk.begin, chunk.end, N, h, dof
         )
         self._singular[share] += singular
-        self._steepest[share] = float(np.maximum(self._steepest[share], steepest))
-        for c, incidences in eliminated.incidences.items():
-            sized = width_for(int(incidences.pair_pointer[-1]), self._most_pairs)
+        self._steepest[share].append(steepest)
+        for c, pointer, block, pairs, widths in squares:
             _eliminate(
-                incidences.pointer, incidences.block, *equations.blocks_of_chunk(share, chunk, c), N, h,
-                chunk.begin, chunk.end, incidences.pair_slots, incidences.pair_pointer, self._Y[share],
-                S[c, c], self._g[share][c], sized(eliminated.dof), sized(self.layout.kept[c].width), sized(1),
+                pointer, block, *equations.blocks_of_chunk(share, chunk, c), N, h, chunk.begin, chunk.end,
+                *pairs, Y, S[c, c], self._g[share][c], *widths,
             )  # fmt: skip
-        for (a, b), (slots, pointer) in eliminated.cross.items():
-            sized = width_for(int(pointer[-1]), self._most_pairs)
+        for a, pointer_a, b, pointer_b, pairs, widths in crosses:
             _eliminate_cross(
-                eliminated.incidences[a].pointer, *equations.blocks_of_chunk(share, chunk, a),
-                eliminated.incidences[b].pointer, *equations.blocks_of_chunk(share, chunk, b),
-                N, chunk.begin, chunk.end, slots, pointer, self._Y[share], S[a, b],
-                sized(eliminated.dof), sized(self.layout.kept[a].width), sized(self.layout.kept[b].width),
+                pointer_a, *equations.blocks_of_chunk(share, chunk, a),
+                pointer_b, *equations.blocks_of_chunk(share, chunk, b),
+                N, chunk.begin, chunk.end, *pairs, Y, S[a, b], *widths,
             )  # fmt: skip
         if chunk is self._last[share]:
             self._sums.end(share)
@@ -287,7 +281,7 @@ class ReducedSystem:
 
     def largest_landmark_slope(self) -> float:
         """Return the largest component of the landmarks' gradient over the root of its diagonal entry of V."""
-        return float(np.sqrt(np.max(self._steepest)))
+        return float(np.sqrt(np.max([slope for slopes in self._steepest for slope in slopes])))
 
     def incident_products(self, delta_kept: list[FloatArray]) -> list[FloatArray]:
         """Return W delta_c for the landmarks of each eliminated group, (count * dof,)."""
@@ -328,6 +322,24 @@ class ReducedSystem:
         parts = self.equations.workers.map(work, len(self.equations.shares))
         self.landmark_squares, self.landmark_slope = (sum(part[i] for part in parts) for i in range(2))
         return deltas
+
+
+def _products(layout: Layout) -> list[tuple]:
+    """Return of each group of landmarks its width, and the arguments of both loops that all of its chunks share."""
+    count = max((int(i.pair_pointer[-1]) for e in layout.eliminated for i in e.incidences.values()), default=0)
+    products = []
+    for e in layout.eliminated:
+        squares, crosses = [], []
+        for c, i in e.incidences.items():
+            sized = width_for(int(i.pair_pointer[-1]), count)
+            widths = sized(e.dof), sized(layout.kept[c].width), sized(1)
+            squares.append((c, i.pointer, i.block, (i.pair_slots, i.pair_pointer), widths))
+        for (a, b), pairs in e.cross.items():
+            sized = width_for(int(pairs[1][-1]), count)
+            widths = sized(e.dof), sized(layout.kept[a].width), sized(layout.kept[b].width)
+            crosses.append((a, e.incidences[a].pointer, b, e.incidences[b].pointer, pairs, widths))
+        products.append((width(e.dof), squares, crosses))
+    return products
 
 
 def _spans(layout: Layout, share: list[Chunk]) -> dict[tuple[int, int], Spans]:

@@ -31,12 +31,13 @@ class DuplicateGates:
     )
 
 
-def not_duplicates(
-    tracks: Tracks, neighbors: list[IntArray], min_images: int, gates: DuplicateGates = DuplicateGates()
-) -> BoolArray:
+GATES = DuplicateGates()
+
+
+def not_duplicates(tracks: Tracks, neighbors: list[IntArray], min_images: int) -> BoolArray:
     """(L,) lines that no other line explains."""
     good, images = np.ones(tracks.num_lines, bool), tracks.num_images()
-    for reach, ratio in ((AGREEMENT.same_edge, gates.min_ratio), (None, 1.0)):
+    for reach, ratio in ((AGREEMENT.same_edge, GATES.min_ratio), (None, 1.0)):
         hit = near_lines(tracks, neighbors, reach)
         owner = tracks.line_of[hit[:, 1]]
         stronger = (owner >= 0) & (images[hit[:, 0]] > images[owner]) & (images[hit[:, 0]] >= ratio * images[owner])

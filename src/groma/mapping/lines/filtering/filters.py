@@ -32,6 +32,9 @@ class FilterGates:
     )
 
 
+GATES = FilterGates()
+
+
 @dataclass(frozen=True, eq=False)
 class Evidence:
     """What filters know beside the lines."""
@@ -96,7 +99,6 @@ def is_edge(
     seen: IntArray,
     expected: IntArray,
     options: MapLinesOptions,
-    gates: FilterGates = FilterGates(),
 ) -> BoolArray:
     """(L,) lines of segments that are found again, and shown by those that should show them.
 
@@ -108,7 +110,7 @@ def is_edge(
     again = found_again(kinds.length, kinds.strength, line_of, possible, len(seen), least)
     told = kinds.length, kinds.strength, kinds.sigma
     odds = edge_odds(told, line_of, possible, seen, expected, options.min_images)
-    return again & (odds >= scipy.special.logit(gates.min_edge_probability))
+    return again & (odds >= scipy.special.logit(GATES.min_edge_probability))
 
 
 def not_duplicate(tracks: Tracks, evidence: Evidence) -> Verdict:

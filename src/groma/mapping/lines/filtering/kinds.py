@@ -39,6 +39,9 @@ class KindGates:
     top_quantile: float = gate(0.9, "quantile", "of p that stands for the best kind", "chosen on benchmarks/lines.py")
 
 
+GATES = KindGates()
+
+
 #: Newton steps of the fit at most (cost: none are made after convergence).
 _STEPS = 50
 
@@ -77,7 +80,6 @@ def found_again(
     eligible: BoolArray,
     num_lines: int,
     least: float,
-    gates: KindGates = KindGates(),
 ) -> BoolArray:
     """Lines whose segments are of a kind that is found again.
 
@@ -93,8 +95,6 @@ def found_again(
         Number of lines.
     least : float
         The mean probability asked of a line where most segments are part of one; 0 keeps all lines.
-    gates : KindGates, optional
-        What is asked of a line beside.
 
     Returns
     -------
@@ -105,7 +105,7 @@ def found_again(
     if least <= 0.0 or not member.any():
         return np.ones(num_lines, bool)
     p = repeatability(length, strength, eligible, member)
-    best = gates.top_share * float(np.quantile(p[eligible], gates.top_quantile))
+    best = GATES.top_share * float(np.quantile(p[eligible], GATES.top_quantile))
     asked = min(max(least, 1.0 - float(member[eligible].mean())), best)
     number = np.bincount(line_of[member], minlength=num_lines)
     mean = np.bincount(line_of[member], p[member], minlength=num_lines) / np.maximum(number, 1)

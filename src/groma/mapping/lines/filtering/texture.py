@@ -63,6 +63,9 @@ class TextureGates:
     )
 
 
+GATES = TextureGates()
+
+
 def num_expected(tracks: Tracks, neighbors: list[IntArray], size: IntArray, min_length: float) -> IntArray:
     """(L,) how many images should show each line: its own and their neighbours, where ``min_length`` of it is in view.
 
@@ -97,7 +100,6 @@ def edge_odds(
     seen: IntArray,
     expected: IntArray,
     min_images: int,
-    gates: TextureGates = TextureGates(),
 ) -> FloatArray:
     """Log odds (L,) that a line is an edge, not texture.
 
@@ -113,8 +115,6 @@ def edge_odds(
         Number of images that show each line, and that should.
     min_images : int
         Lines of fewer images were dropped.
-    gates : TextureGates, optional
-        The two populations, and the priors.
     """
     expit, log_expit = scipy.special.expit, scipy.special.log_expit
     member = line_of >= 0
@@ -123,11 +123,11 @@ def edge_odds(
     number = np.maximum(np.bincount(line_of[member], minlength=len(seen)), 1)
     sums = [np.bincount(line_of[member], column, minlength=len(seen)) for column in features[member].T]
     lines = np.column_stack(sums) / number[:, None]
-    ratio = _log_chance(seen, expected, min_images, gates.edge)
-    ratio -= _log_chance(seen, expected, min_images, gates.texture)
+    ratio = _log_chance(seen, expected, min_images, GATES.edge)
+    ratio -= _log_chance(seen, expected, min_images, GATES.texture)
 
-    prior_odds, odds_sigma = np.log([share / (1.0 - share) for share in gates.line_shares]), gates.share_sigma
-    spread = np.array([gates.weight_sigma[0]] + [gates.weight_sigma[1]] * len(kinds))
+    prior_odds, odds_sigma = np.log([share / (1.0 - share) for share in GATES.line_shares]), GATES.share_sigma
+    spread = np.array([GATES.weight_sigma[0]] + [GATES.weight_sigma[1]] * len(kinds))
 
     def cost(p: FloatArray) -> tuple[float, FloatArray]:
         weights, odds = p[:-2], p[-2:]

@@ -41,6 +41,9 @@ class ConsensusGates:
     )
 
 
+GATES = ConsensusGates()
+
+
 # ------------------------------------------------------------------------------------------------------------ Kernels
 @kernel
 def _distance(d1, d2, c11, c12, c22):
@@ -212,7 +215,6 @@ def choose(
     num_segments: int,
     num_neighbors: int,
     min_support: int,
-    gates: ConsensusGates = ConsensusGates(),
 ) -> Choice:
     """Choose the place of each segment by the summed support of distinct neighbours."""
     neighbor, other = np.empty_like(proposals.neighbor), np.empty_like(proposals.other)
@@ -224,7 +226,7 @@ def choose(
     score, rival = np.zeros(num_segments), np.zeros(num_segments)
     supporters = np.full((num_segments, num_neighbors), -1, np.int64)
     _choose(
-        pointers, neighbor, other, values, total, num_neighbors, max_squared, gates.half_weight, gates.num_seeds,
-        gates.fusing_rounds, min_support, q, covariance, score, supporters, rival,
+        pointers, neighbor, other, values, total, num_neighbors, max_squared, GATES.half_weight, GATES.num_seeds,
+        GATES.fusing_rounds, min_support, q, covariance, score, supporters, rival,
     )  # fmt: skip
     return Choice(score > 0.0, q, covariance, score, rival, supporters)

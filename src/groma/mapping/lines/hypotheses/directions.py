@@ -46,18 +46,19 @@ class DirectionGates:
     )
 
 
-def depth_ratios(
-    scene: Scene, segments: Sequence[Segments], views: LineViews, gates: DirectionGates = DirectionGates()
-) -> FloatArray:
+GATES = DirectionGates()
+
+
+def depth_ratios(scene: Scene, segments: Sequence[Segments], views: LineViews) -> FloatArray:
     """Ratio q2 / q1 of each segment and its standard deviation, (S, 2); zero without a vanishing point."""
     work = []
     for i in range(scene.num_images):
         rows, camera = views.rows(i), scene.images.camera_idx[i]
         chosen = views.usable_rows(i) - rows.start
-        chosen = chosen[np.argsort(-views.length[rows][chosen], kind="stable")[: gates.num_voters]]
+        chosen = chosen[np.argsort(-views.length[rows][chosen], kind="stable")[: GATES.num_voters]]
         model = camera_models.model(scene.cameras.models[camera]), scene.cameras.params_of(camera)
         work.append((segments[i].select(chosen), chosen, views.ray[rows], scene.cam_from_world[i, :4], model))
-    return np.concatenate([np.zeros((0, 2)), *map_work(partial(_ratios_in, gates), work)])
+    return np.concatenate([np.zeros((0, 2)), *map_work(partial(_ratios_in, GATES), work)])
 
 
 def _ratios_in(gates: DirectionGates, image: tuple) -> FloatArray:

@@ -39,6 +39,9 @@ class EarlierGates:
     )
 
 
+GATES = EarlierGates()
+
+
 @dataclass(frozen=True, eq=False)
 class Known:
     """What is known of the segments (n,) of one image, and its k neighbours."""
@@ -85,10 +88,9 @@ class EarlierMap:
 
 def _moved_px(
     before: Scene, after: Scene, views: LineViews, i: int, others: IntArray, places: FloatArray,
-    gates: EarlierGates = EarlierGates(),
 ) -> FloatArray:  # fmt: skip
     """(k,) how far the epipolar lines of image i in others moved at places it sees, pixels; infinite without places."""
-    places = places[:: max(1, len(places) // gates.num_points)]
+    places = places[:: max(1, len(places) // GATES.num_points)]
     if not len(places) or not len(others):
         return np.full(len(others), np.inf)
     first = _pixels(before, after, np.full(len(places), i), places)
@@ -103,7 +105,7 @@ def _moved_px(
     for n, one in enumerate(away):
         one = one[np.isfinite(one)]
         if len(one):
-            moved[n] = np.quantile(one, 1.0 - gates.moved_share)
+            moved[n] = np.quantile(one, 1.0 - GATES.moved_share)
     return moved
 
 

@@ -35,6 +35,9 @@ class KnownPointGates:
     )
 
 
+GATES = KnownPointGates()
+
+
 # ------------------------------------------------------------------------------------------------------------ Kernels
 @kernel
 def _points_on(ends, line, pixel, inverse, max_distance, t, q):
@@ -142,7 +145,6 @@ def lines_through_points(
     ratios: FloatArray,
     points: tuple[FloatArray, FloatArray],
     slot: int,
-    gates: KnownPointGates = KnownPointGates(),
 ) -> tuple[IntArray, FloatArray]:
     """Lines through known points on the segments of an image, as proposals.
 
@@ -167,7 +169,7 @@ def lines_through_points(
     """
     index, values = np.empty((2 * len(ratios), 3), np.int64), np.empty((2 * len(ratios), 6))
     count = _propose(
-        views.ends[rows], views.line[rows], views.usable[rows], views.range[rows], ratios, *points, gates.max_distance,
-        gates.tolerance, AGREEMENT.min_overlap, slot, index, values,
+        views.ends[rows], views.line[rows], views.usable[rows], views.range[rows], ratios, *points, GATES.max_distance,
+        GATES.tolerance, AGREEMENT.min_overlap, slot, index, values,
     )  # fmt: skip
     return index[:count], values[:count]
