@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from groma.evaluation.trajectory import score_trajectory
+from groma.features.images import one_opencv_thread
 from groma.io.sequences import open_sequence
 from groma.tracking import Tracker
 
@@ -75,6 +76,8 @@ def main() -> None:
     parser.add_argument("--waits", action="store_true", help="also what the answering thread waits for (Linux)")
     arguments = parser.parse_args()
     sequence = open_sequence(arguments.sequence)
+    if sequence.camera.baseline is None:  # as the command does
+        one_opencv_thread()
     frames = list(sequence)
     print("| fed | answer, median | 95 % | CPU of that thread, median | 95 % | CPU of all, mean | position error |")
     print("|---|--:|--:|--:|--:|--:|--:|")

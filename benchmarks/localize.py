@@ -89,6 +89,7 @@ def stairs(path: Path, seeds: int = 20) -> dict[str, object]:
             "seconds": seconds,
         }
     found = estimate_absolute_pose(camera, *points, *lines)
+    assert found.cam_from_world is not None and found.covariance is not None and found.center_sigma is not None
     told["stated cm"] = 100 * float(np.linalg.norm(found.center_sigma))
     told["stated deg"] = found.rotation_sigma_deg
     told["verdict"] = f"{found.status}: {found.sentence}"
@@ -115,12 +116,13 @@ def _by_all_lines(camera, gray, lines, pose, reach=12.0, rounds=6) -> tuple[int,
     found = find_features(gray, camera, True, 15.0).segments
     alike = np.ones((len(lines), 1), np.float32)  # no descriptors: place and direction decide
     seen = SeenLines(np.arange(len(lines)), alike, lines)
+    agree = 0
     for _ in range(rounds):
         line, segment = lines_near(camera, pose, seen, found, alike[: len(found)], reach).T
         matches = Matches(segments2d=found.ends.reshape(-1, 2, 2)[segment], segments3d=lines[line]).with_sigma(1.0)
         fit = refine(camera, matches, pose, (reach, reach))
-        pose = fit.pose
-    return int(fit.line_inliers.sum()), pose
+        agree, pose = int(fit.line_inliers.sum()), fit.pose
+    return agree, pose
 
 
 def _poselib(camera, points, lines, seed):
@@ -128,12 +130,14 @@ def _poselib(camera, points, lines, seed):
 
     K = {"model": camera.model, "width": camera.width, "height": camera.height, "params": camera.params.tolist()}
     options = {"max_reproj_error": 6.8, "max_epipolar_error": 6.8, "seed": seed}
+    points2d, points3d = points
     if lines is None:
-        found, _ = poselib.estimate_absolute_pose(*points, K, options, {})
+        found, _ = poselib.estimate_absolute_pose(points2d, points3d, K, options, {})
     else:
         ends, ends3d = lines
-        places = (ends[:, 0], ends[:, 1], ends3d[:, 0], ends3d[:, 1])
-        found, _ = poselib.estimate_absolute_pose_pnpl(*points, *places, K, options, {})
+        found, _ = poselib.estimate_absolute_pose_pnpl(
+            points2d, points3d, ends[:, 0], ends[:, 1], ends3d[:, 0], ends3d[:, 1], K, options, {}
+        )
     return np.concatenate([found.q[[1, 2, 3, 0]], found.t])
 
 
@@ -142,7 +146,8 @@ def _pycolmap(camera, points, seed):
 
     pycolmap.set_random_seed(seed)
     K = pycolmap.Camera(model=camera.model, width=camera.width, height=camera.height, params=camera.params.tolist())
-    found = pycolmap.estimate_and_refine_absolute_pose(*points, K)
+    points2d, points3d = points
+    found = pycolmap.estimate_and_refine_absolute_pose(points2d, points3d, K)
     if found is None:
         return None
     pose = found["cam_from_world"]
@@ -175,10 +180,10 @@ def held_out(map_: Path, images: Path, truth: Path, align: bool, every: int = 1)
             start = time.process_time()
             found = localizer.localize(path)
             seconds = time.process_time() - start
-            if found.pose.cam_from_world is None:
+            if found.pose.cam_from_world is None or found.pose.center_sigma is None:
                 rows.append((query, found.pose.status, None, None, None, seconds))
                 continue
-            here = _matrix(found.pose.cam_from_world) @ np.linalg.inv(moved)
+            here = np.asarray(_matrix(found.pose.cam_from_world) @ np.linalg.inv(moved), np.float64)
             pose = np.concatenate([quaternion.from_matrix(here[None, :3, :3])[0], here[:3, 3]])
             sigma = float(np.linalg.norm(found.pose.center_sigma))
             rows.append((query, found.pose.status, *_errors(pose, poses[query]), sigma, seconds))

@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 from groma import _numba
-from groma._kernels.inner import Pipeline, _NoMachineCode
+from groma._kernels import inner
+from groma._kernels.inner import Pipeline, _for_linking, _NoMachineCode
 from groma.compiled import kernel, loop
 
 pytestmark = [
@@ -189,3 +190,34 @@ def test_another_process_links_what_this_one_has_kept(tmp_path):
     assert run("largest", "square", "total") == ["1.0", "4.0", "3.0", "0", "3"]
     sizes = sorted(file.stat().st_size for file in Path(tmp_path).rglob("*.square-*.nbc"))
     assert len(sizes) == 2 and sizes[0] < 0.7 * sizes[1]
+
+
+def _doubled(value):
+    return 2.0 * value
+
+
+@numba.extending.overload(_doubled)
+def _overload_of_doubled(value):
+    return lambda value: 2.0 * value
+
+
+@loop
+def _all_doubled(values, out):
+    for k in range(values.shape[0]):
+        out[k] = _doubled(values[k])
+
+
+def test_numba_uses_its_own_functions_after_they_were_compiled_for_linking(monkeypatch, tmp_path):
+    """Numba makes ``np.empty`` and the like in this way, once in a process."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    made, out, again = [], np.zeros(len(VALUES)), np.zeros(len(VALUES))
+    monkeypatch.setattr(inner, "_for_linking", lambda dispatcher: made.append(_for_linking(dispatcher)) or made[-1])
+    _all_doubled(VALUES, out)
+    assert np.array_equal(out, 2.0 * VALUES)
+    assert made and not any(any(_has_machine_code(function)) for function in made)
+    numba.njit(_all_doubled.py_func)(VALUES, again)
+    assert np.array_equal(again, out)
+    for function in made:  # as for a call from Python
+        for kinds in list(function.overloads):
+            function.compile(kinds)
+        assert all(_has_machine_code(function))

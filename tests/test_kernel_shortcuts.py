@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What the compiler is told sooner is what Numba finds out; arguments come back as they were."""
 
+import itertools
 import operator
 import sys
 
+import llvmlite.binding as llvm
 import numba
 import numpy as np
 import pytest
-from numba.core import types
+from numba.core import event, types
 from numba.core.registry import cpu_target
 
 from groma._kernels import shortcuts
@@ -95,6 +97,28 @@ def test_operators_mean_what_they_mean_to_numba():
             meant = context.resolve_function_type(add, (one, other), {})
             for _ in range(2):
                 assert shortcuts._Typing(context).resolve_function_type(add, (one, other), {}) == meant
+
+
+def test_code_is_made_for_what_operators_mean_to_numba():
+    context = cpu_target.typing_context
+    context.refresh()
+    kinds = types.float64, types.int64, types.float32, types.boolean, types.literal(3), types.float64[::1]
+    for one in (operator.add, operator.truediv, operator.lt, operator.pow, max):
+        function = context.resolve_value_type(one)
+        for pair in itertools.product(kinds[: -1 if one is max else None], repeat=2):
+            meant = function.get_call_type(context, pair, {})
+            with shortcuts.remembering():
+                found = [function.get_call_type(context, pair, {}) for _ in range(2)]
+            assert found == [meant, meant]
+
+
+def test_who_listens_to_calls_of_llvm_hears_them():
+    with event.install_recorder("numba:llvm_lock") as heard, shortcuts.remembering():
+        llvm.parse_assembly("")
+    assert heard.buffer
+    with shortcuts.remembering():
+        assert not llvm.ffi.lib._lock._cblist
+    assert llvm.ffi.lib._lock._cblist
 
 
 def test_setting_and_attributes_mean_what_they_mean_to_numba():

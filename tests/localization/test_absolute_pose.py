@@ -19,7 +19,7 @@ from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pieces import cells_elsewhere
 from groma.localization.pose.refinement import _of_normal_noise, _pull, fitted, last_scale, refine
-from groma.localization.pose.verdict import votes_of_a_rival
+from groma.localization.pose.verdict import evidence_of, votes_of_a_rival
 
 #: What wrong matches may still do: the loss leaves them a small weight. A pixel is 0.007 here.
 OUTLIERS = 5e-4
@@ -61,7 +61,7 @@ def test_wrong_matches_do_not_pull_the_pose_away():
     camera = QueryCamera("PINHOLE", made["camera"], *map(int, made["size"]))
     options = PoseOptions(max_error=4.0, look_for_rival=False)
     found = estimate_absolute_pose(camera, made["points2d"], made["points3d"], sigma=(2.0, 2.0), options=options)
-    assert found.status == "localized", found.sentence
+    assert found.status == "localized" and found.cam_from_world is not None, found.sentence
     off = se3.log(se3.compose(found.cam_from_world[None], se3.inverse(made["cam_from_world"][None])))[0]
     assert np.abs(off).max() < 0.1
     away = np.linalg.norm(camera.project(found.cam_from_world, made["points3d"]) - made["points2d"], axis=1)
@@ -218,7 +218,7 @@ def test_two_places_that_fit_equally_well_are_told_as_two():
     found = estimate_absolute_pose(CAMERA, pixels, both)
     assert found.status == "uncertain"
     assert "Two places" in found.sentence
-    assert found.rival is not None
+    assert found.cam_from_world is not None and found.rival is not None
     poses = (found.cam_from_world, found.rival)
     centers = [-quaternion.to_matrix(one[None, :4])[0].T @ one[4:] for one in poses]
     assert np.linalg.norm(centers[0] - centers[1]) == pytest.approx(1.5, abs=1e-3)
@@ -257,7 +257,8 @@ def test_poses_with_too_few_votes_are_not_judged():
     """What else would be asked of them is not."""
     world = make_world(np.random.default_rng(2), points=200)
     matches = Matches(world.points2d, world.points3d)
-    votes = pose_from_matches(CAMERA, matches).votes
+    found = refine(CAMERA, matches, world.pose, max_errors(matches))
+    votes = evidence_of(found, matches).agree
     asked = []
     for enough in (votes, votes + 1):
         expected = lambda best: asked.append(best) or ((9.0, 0.0), 1.0)  # noqa: E731
@@ -338,7 +339,9 @@ def test_an_estimated_lens_makes_the_pose_less_certain():
         world = make_world(rng, points=120, lines=0, camera=lens)
         world.points2d[:] += rng.normal(0.0, 1.0, world.points2d.shape)
         found = of(world, ("points",), lens, options=PoseOptions(refine_lens=True))
-        sigmas.append(np.linalg.norm(found.center_sigma) / np.linalg.norm(of(world, ("points",), lens).center_sigma))
+        known = of(world, ("points",), lens)
+        assert found.center_sigma is not None and known.center_sigma is not None
+        sigmas.append(np.linalg.norm(found.center_sigma) / np.linalg.norm(known.center_sigma))
         squares.append(_normalised_error(world, found))
     assert np.median(sigmas) > 1.5
     assert 3.5 < np.mean(squares) < 6.0 + 3.0 * np.sqrt(12.0 / 40.0)
@@ -348,6 +351,7 @@ def test_the_same_seed_gives_the_same_pose_and_arguments_stay():
     world = make_world(np.random.default_rng(47))
     before = world.points2d.copy(), world.segments3d.copy()
     first, second = of(world, ("points", "lines")), of(world, ("points", "lines"))
+    assert first.cam_from_world is not None and second.cam_from_world is not None
     assert np.array_equal(first.cam_from_world, second.cam_from_world)
     assert np.array_equal(before[0], world.points2d) and np.array_equal(before[1], world.segments3d)
 

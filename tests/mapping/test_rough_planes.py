@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Covers planes fitted again to members that deviate from them: a rough wall, a flat one, and lines on a wall."""
+"""Covers planes fitted again to members that deviate from them, and pieces of a rough wall that become one plane."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,14 +18,18 @@ SIGMA, LEVEL, LEAST, SUPPORT = 0.002, 0.99, (0.7, 0.9), 20
 TILT = 0.004
 
 
-def wall(deviation, num_points=400, num_lines=40):
-    """Landmarks on the plane z = 0, each off by its noise and by how rough the wall is."""
+def wall(deviation, num_points=400, num_lines=40, before=None):
+    """Landmarks on the plane z = 0, each off by its noise and by how rough the wall is.
+
+    Where ``before`` says so, a part of the wall stands before it by so much, and is flat.
+    """
     rng = np.random.default_rng(3)
     points = np.column_stack([rng.uniform(-2.0, 2.0, (num_points, 2)), np.zeros(num_points)])
     start = np.column_stack([rng.uniform(-1.5, 1.5, (num_lines, 2)), np.zeros(num_lines)])
     segments = np.stack([start, start + np.array([0.5, 0.0, 0.0])], axis=1)
     points += SIGMA * rng.standard_normal(points.shape)
-    points[:, 2] += deviation * rng.standard_normal(num_points)
+    away = deviation * rng.standard_normal(num_points)
+    points[:, 2] += away if before is None else np.where(panel(points), before, away)
     segments[..., 1:] += SIGMA * rng.standard_normal((num_lines, 2, 2))
     segments[..., 2] += deviation * rng.standard_normal((num_lines, 1))
     across = np.broadcast_to(np.eye(3)[1:], (num_lines, 2, 3)).copy()
@@ -41,6 +47,22 @@ def wall(deviation, num_points=400, num_lines=40):
         np.full(num_points, 0.01),
         np.full(num_lines, 0.01),
     )
+
+
+def panel(points):
+    """Which points are in the sixteenth of the wall that may stand before the rest."""
+    return ((points[..., :2] > 0.0) & (points[..., :2] < 1.0)).all(axis=-1)
+
+
+def pieces_of(marks, offsets, parts):
+    """Planes with these offsets, found in these parts (K, P) of the points; no line was taken out with one."""
+    num = len(offsets)
+    planes = np.column_stack([np.tile([0.0, 0.0, 1.0], (num, 1)), -np.asarray(offsets)])
+    covariance = np.tile(np.diag([SIGMA**2, SIGMA**2, 0.0, SIGMA**2]) / 200, (num, 1, 1))
+    label = np.where(np.any(parts, axis=0), np.argmax(parts, axis=0), -1)
+    numbers = np.array([one.sum() for one in parts]), np.ones(num), np.full(num, 4 * SIGMA), np.full(num, -9.0)
+    lines = np.full(len(marks.segments), -1)
+    return PlaneSet(planes, covariance, *numbers, label, lines, [marks.points[one] for one in parts])
 
 
 def found_in(marks, tilt):
@@ -95,3 +117,60 @@ def test_no_planes():
     none = PlaneSet(np.zeros((0, 4)), np.zeros((0, 4, 4)), *np.zeros((4, 0)), np.full(400, -1), np.full(40, -1))
     planes, points, lines = on_fitted_planes(marks, none, LEVEL, LEAST, SUPPORT)
     assert len(planes) == len(points.pairs) == len(lines.pairs) == 0
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_pieces_of_a_rough_wall_become_one_plane(order):
+    marks = wall(0.004)
+    left = marks.points[:, 0] < 0.0
+    offsets, parts = [0.003, -0.003], [left, ~left]
+    pieces = pieces_of(marks, [offsets[k] for k in order], [parts[k] for k in order])
+    planes, points, lines = on_fitted_planes(marks, pieces, LEVEL, LEAST, SUPPORT)
+    assert len(planes) == 1 and set(planes.point_label) == {0}
+    assert off(planes) < chi_square_gate(0.001, 3)
+    assert 0.4 / 1.2 < points.deviation.max() < 0.4 * 1.2
+    assert len(lines.pairs) >= 37 and planes.support[0] == len(marks.points) == len(planes.places[0])
+
+
+def test_flat_planes_beside_each_other_stay_two():
+    marks = wall(0.0, num_lines=0, before=0.008)
+    flat = pieces_of(marks, [0.0, 0.008], [~panel(marks.points), panel(marks.points)])
+    planes, points, _ = on_fitted_planes(marks, flat, LEVEL, LEAST, SUPPORT)
+    assert planes is flat and set(points.pairs[:, 1]) == {0, 1}
+
+
+def test_a_flat_panel_well_before_a_rough_wall_is_no_piece_of_it():
+    # Five deviations before it, and within the layer of three bands.
+    marks = wall(0.004, num_lines=0, before=0.02)
+    front = panel(marks.points)
+    planes, points, _ = on_fitted_planes(marks, pieces_of(marks, [0.0, 0.02], [~front, front]), LEVEL, LEAST, SUPPORT)
+    assert len(planes) == 2
+    on_panel = points.pairs[points.pairs[:, 1] == 1, 0]
+    # One of a hundred fails the test of a member.
+    assert front[on_panel].all() and len(on_panel) > 0.95 * front.sum()
+
+
+def test_a_rough_wall_beyond_a_gap_is_another_one():
+    marks = wall(0.004)
+    left, right = marks.points[:, 0] < -1.0, marks.points[:, 0] > 1.0
+    apart = pieces_of(marks, [0.001, -0.001], [left, right])
+    usable = left | right
+    marks = replace(marks, point_usable=usable, line_usable=np.zeros(40, bool))
+    apart = replace(apart, point_label=apart.point_label[usable], segment_label=np.zeros(0, int))
+    planes, points, _ = on_fitted_planes(marks, apart, LEVEL, LEAST, SUPPORT)
+    assert len(planes) == 2 and (points.deviation > 0.0).all()
+
+
+def stairs(step):
+    """Three parts of a wall side by side, each before the last, the last of them rough, and the parts."""
+    marks = wall(0.0, num_points=600, num_lines=0)
+    number = np.digitize(marks.points[:, 0], [-0.4, 0.8])
+    marks.points[:, 2] += step * number + 0.003 * np.random.default_rng(4).standard_normal(600) * (number == 2)
+    return marks, [number == k for k in range(3)]
+
+
+@pytest.mark.parametrize("step", [0.004, 0.006, 0.008])
+def test_steps_are_no_pieces_of_a_wall_that_leans(step):
+    marks, parts = stairs(step)
+    planes, _, _ = on_fitted_planes(marks, pieces_of(marks, step * np.arange(3), parts), LEVEL, LEAST, SUPPORT)
+    assert len(planes) == 3 and np.abs(planes.planes[:2, :2]).max() < 0.001

@@ -5,6 +5,7 @@ Numba gives each function machine code and a wrapper that Python calls. A kernel
 callers, so both are thrown away. Here a function that is compiled inside another one ends as LLVM's code. What is
 inlined, and so every number, is the same. If Python calls such a function later, it is compiled once more, in full.
 Wrappers are not optimised: a call takes 20 nanoseconds more, of half a microsecond, and compiling a seventh less.
+Numba's own functions that ours call, such as ``np.empty``, are compiled in the same way.
 
 In come the pipeline and the libraries of Numba's compiler; out comes ``Pipeline``, which ``numba.njit`` is told to use.
 """
@@ -24,11 +25,12 @@ from numba.core.compiler_machinery import PassManager
 from numba.core.sigutils import normalize_signature
 from numba.core.typed_passes import NativeLowering as NumbaLowering
 from numba.core.typed_passes import NopythonTypeInference
+from numba.core.typing.templates import _OverloadFunctionTemplate
 
 from groma._kernels.elements import NativeLowering
 from groma._kernels.lifetimes import on_demand
 from groma._kernels.loading import rebuilt
-from groma._kernels.shortcuts import TypeInference
+from groma._kernels.shortcuts import TypeInference, remembering
 
 #: Steps of Numba's compiler, and what takes their place.
 OURS = {NumbaLowering: NativeLowering, NopythonTypeInference: TypeInference}
@@ -115,7 +117,7 @@ class _Steps(PassManager):
     """Numba's steps of compiling, without the events, descriptions and clocks around each, a twentieth of the time."""
 
     def run(self, state: Any) -> None:
-        with on_demand():
+        with on_demand(), remembering(), _linking_overloads():
             super().run(state)
 
     def _runPass(self, index: int, pss: Any, internal_state: Any) -> None:  # type: ignore[override]  # noqa: N802
@@ -211,3 +213,40 @@ def tell_apart(dispatcher: Any) -> None:
 
     dispatcher.compile = compile_for_caller
     dispatcher.add_overload = add_overload
+
+
+_decorator = _OverloadFunctionTemplate._get_jit_decorator
+
+
+def _linking_decorator(self: Any) -> Any:
+    """Take the place of :meth:`_OverloadFunctionTemplate._get_jit_decorator`: what is compiled by it is for linking."""
+    decorator = _decorator(self)
+
+    def decorate(**options: Any) -> Any:
+        options = {"pipeline_class": Pipeline, **options}
+        return lambda function: _for_linking(decorator(**options)(function))
+
+    return decorate
+
+
+def _for_linking(dispatcher: Any) -> Any:
+    compile_function = dispatcher._compiler.compile
+
+    def compile_inside(*arguments: Any) -> Any:
+        with one_deeper():
+            return completed(compile_function(*arguments))
+
+    dispatcher._compiler.compile = compile_inside
+    tell_apart(dispatcher)
+    return dispatcher
+
+
+@contextmanager
+def _linking_overloads() -> Iterator[None]:
+    """Compile Numba's own functions for linking; for a thread that holds the lock of the compiler."""
+    before = _OverloadFunctionTemplate._get_jit_decorator
+    _OverloadFunctionTemplate._get_jit_decorator = _linking_decorator
+    try:
+        yield
+    finally:
+        _OverloadFunctionTemplate._get_jit_decorator = before

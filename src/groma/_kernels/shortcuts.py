@@ -3,9 +3,11 @@
 
 Numba looks for the meaning of ``a + b`` among some fifteen rules, in every function and several times in each. Here it
 is remembered by the types of the operands, as are numbers of arrays, attributes such as ``shape``, and functions of
-Python such as ``max``: a tenth of the time that Python takes of a compilation.
+Python such as ``max``: a tenth of the time that Python takes of a compilation. Numba asks again when it makes code,
+and tells whoever listens of every call of LLVM, though nobody does: another tenth.
 
-In come steps and classes of Numba's compiler; out comes ``TypeInference``, one of the steps.
+In come steps and classes of Numba's compiler; out come ``TypeInference``, one of the steps, and ``remembering``, inside
+which code is made.
 """
 
 from __future__ import annotations
@@ -13,11 +15,15 @@ from __future__ import annotations
 import builtins
 import math
 import operator
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
-from numba.core import types
+import llvmlite.binding as llvm
+from numba.core import event, types
 from numba.core.compiler_machinery import register_pass
 from numba.core.typed_passes import NopythonTypeInference
+from numba.core.types.functions import BaseFunction
 
 _KNOWN = frozenset(
     value
@@ -27,6 +33,9 @@ _KNOWN = frozenset(
 )
 #: Meaning of operators for types of operands, and the like, with what it was found in.
 _meanings: dict[Any, tuple[Any, Any]] = {}
+#: What Numba calls the events around each call of LLVM.
+_LLVM_CALLS = "numba:llvm_lock"
+_call_type = BaseFunction.get_call_type
 
 
 def _is_simple(kind: Any) -> bool:
@@ -91,3 +100,27 @@ class TypeInference(NopythonTypeInference):
             return super().run_pass(state)
         finally:
             state.typingctx = context
+
+
+def _remembered_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
+    """Take the place of :meth:`BaseFunction.get_call_type`."""
+    if kws or self.typing_key not in _KNOWN or not all(map(_is_simple, args)):
+        return _call_type(self, context, args, kws)
+    key = "call", id(self), tuple(args)
+    if key not in _meanings:
+        _meanings[key] = self, _call_type(self, context, args, kws)
+    return _meanings[key][1]
+
+
+@contextmanager
+def remembering() -> Iterator[None]:
+    """Let Numba look for the meaning of operators once; for a thread that holds the lock of the compiler."""
+    lock: Any = llvm.ffi.lib._lock
+    before = BaseFunction.get_call_type, lock._cblist
+    BaseFunction.get_call_type = _remembered_call_type
+    if not event._registered.get(_LLVM_CALLS):
+        lock._cblist = []
+    try:
+        yield
+    finally:
+        BaseFunction.get_call_type, lock._cblist = before

@@ -87,18 +87,25 @@ def fit_with_covariance(
     ``center`` is their mean by ``precision`` (N,), the ``weights`` (N,) over the variances across the plane.
     """
     normal, away = plane[:3], points - center
-    basis = np.stack(perpendicular(normal))
-    slope = np.column_stack([away @ basis.T, np.ones(len(away))])
+    slope, motion = plane_motions(plane, center, points)
     information = (precision[:, None] * slope).T @ slope
     size = np.sqrt(np.diag(information)) + np.finfo(float).tiny
     correlation = information / np.outer(size, size) + 1e-12 * np.eye(3)
     inner = np.linalg.inv(correlation) / np.outer(size, size)
-    # (n, w) by the two tilts and the offset: n moves along b, w keeps the plane through c.
-    motion = np.zeros((4, 3))
-    motion[:3, :2], motion[3, :2], motion[3, 2] = basis.T, -basis @ center, 1.0
     count = int((weights > 0).sum())
     chi = float((precision * (away @ normal) ** 2).sum()) / max(count - 3, 1)
     return PlaneFit(plane, motion @ inner @ motion.T, chi)
+
+
+def plane_motions(plane: FloatArray, center: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """How distances of points (N, 3) from a plane change with its two tilts around ``center`` and its offset (N, 3).
+
+    And how (n, w) do (4, 3): n moves along the axes of the tilts, and w keeps the plane through the center.
+    """
+    basis = np.stack(perpendicular(plane[:3]))
+    motion = np.zeros((4, 3))
+    motion[:3, :2], motion[3, :2], motion[3, 2] = basis.T, -basis @ center, 1.0
+    return np.column_stack([(points - center) @ basis.T, np.ones(len(points))]), motion
 
 
 def tilt_sigma(covariance: FloatArray) -> FloatArray:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groma.errors import InputError
-from groma.features.edge_fit import measure_edges
+from groma.features.edge_fit import measure_smoothed, smoothed
 from groma.features.images import MIN_SIDE, to_gray
 from groma.features.merging import MERGES, merge_collinear
 from groma.features.segments import MIN_LENGTH, MIN_STRENGTH, Segments
@@ -69,11 +69,12 @@ class LsdDetector:
             return Segments.empty()
         ends = np.asarray(detected, dtype=np.float64).reshape(-1, 4) + 0.5 / self.scale
         ends = _keep_long(ends, min(self.min_length, MERGES.min_piece) if self.merge else self.min_length)
-        ends, sigma, strength = measure_edges(gray, ends, fit=self.fit)
+        smooth = smoothed(gray)
+        ends, sigma, strength = measure_smoothed(smooth, ends, fit=self.fit)
         if self.merge:
             merged = merge_collinear(ends)
             if len(merged) < len(ends):
-                ends, sigma, strength = measure_edges(gray, merged, fit=self.fit)
+                ends, sigma, strength = measure_smoothed(smooth, merged, fit=self.fit)
         height, width = gray.shape
         limit = np.array([width, height, width, height], dtype=np.float64)
         ends = np.clip(ends, 0.0, limit)

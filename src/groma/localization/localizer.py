@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._log import log_warnings, logged_stages
-from groma._typing import IntArray
+from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
 from groma.features.images import GrayImage, to_gray
 from groma.gates import gate
@@ -22,7 +22,7 @@ from groma.localization.candidates import Candidates, MirrorImage, closest_of, d
 from groma.localization.expected import FoundAgain, nearest_images, shown_of
 from groma.localization.features import DescribedImage, DescribedPoints, find_features
 from groma.localization.landmarks import DescribedLandmarks, coarsest, seen_in
-from groma.localization.map_images import OPTIONS, image_paths, images_in_summary
+from groma.localization.map_images import OPTIONS, estimated_in_summary, image_paths, images_in_summary
 from groma.localization.map_index import images_told, kept_index
 from groma.localization.pose.absolute_pose import (
     UNKNOWN_LENS,
@@ -65,6 +65,9 @@ class LocalizeOptions:
     lines: bool = True
     #: Shortest segment, pixels.
     min_segment_length: float = 15.0
+    #: Whether the poses and the calibrations of the map were estimated: their errors are in the covariance of each pose
+    #: then. None: as the summary of the map says; both where there is none.
+    estimated: tuple[bool, bool] | None = None
     #: Numbers of the retrieval.
     gates: LocalizerGates = field(default_factory=LocalizerGates)
     #: Of the poses: see there.
@@ -124,7 +127,10 @@ class Localizer:
         #: Files of the images of the map, in their order.
         self.files = image_paths(self.scene, _folder(map_, images, path))
         #: The descriptions; and what could not be done as wanted, in words.
-        self.index, self.warning = kept_index(self.scene, self.files, path, say)
+        estimated = self.options.estimated
+        if estimated is None:
+            estimated = (True, True) if isinstance(map_, Scene) else estimated_in_summary(Path(map_))
+        self.index, self.warning = kept_index(self.scene, self.files, path, say, estimated)
         if self.warning:
             log_warnings("localization", [self.warning])
         self._retrieval = VladRetrieval(self.index.vocabulary)
@@ -132,6 +138,7 @@ class Localizer:
         self._landmarks = DescribedLandmarks.of(self.index, upright)
         of_points = Described(self.index.point, self.index.pixel, self.index.descriptor, upright[self.index.point])
         self._alike_limits = alike_limits(of_points)
+        self._common = self.index.common_errors(self.scene)
         self._again = FoundAgain.of(self.scene, self.index, self.options.gates.near)
 
     def camera_of_map(self, width: int, height: int) -> QueryCamera | None:
@@ -238,14 +245,27 @@ class Localizer:
             around = nearest_images(self.index, images, agreeing, self.options.gates.near)
             return shown_of(self.scene, self.index, self._again, around, best, seen, alike, self.options.lines)
 
+        def common(best: Refined, used: Matches) -> FloatArray:
+            if self._common is None:
+                return np.zeros((6, 6))
+            landmarks = last[0].points[:, 1], last[0].lines[:, 1]
+            return self._common.of_query(best, used, landmarks, self._own_camera(best.camera))
+
         matches = found.matches(part, self.scene, self.index)
         mirror = MirrorImage(
             query, part, camera, self.scene, self.index, lambda points: matched(points, self._alike(points)),
             self.options.gates.near,
         )  # fmt: skip
         asked = MirrorQuestions(mirror.matches, closest)
-        pose = pose_from_matches(camera, matches, options, max(len(images), 1), guided, asked, expected, enough)
+        pose = pose_from_matches(camera, matches, options, max(len(images), 1), guided, asked, expected, enough, common)
         return pose, last[0]
+
+    def _own_camera(self, camera: QueryCamera) -> int | None:
+        """The camera of the map with this very calibration."""
+        table = self.scene.cameras
+        alike = [row for row in range(len(table)) if table.models[row] == camera.model]
+        same = [row for row in alike if np.array_equal(table.params_of(row), camera.params)]
+        return same[0] if same else None
 
     @staticmethod
     def _reach(query: DescribedImage, best: Refined) -> float:

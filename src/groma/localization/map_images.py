@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Where the photographs of a map are."""
+"""What the files of a map say besides the map: where its photographs are, and what of it was estimated."""
 
 from __future__ import annotations
 
@@ -50,3 +50,18 @@ def images_in_summary(map_: Path) -> Path | None:
         return Path(told) if isinstance(told, str) and Path(told).is_dir() else None
     except (OSError, ValueError, AttributeError, GromaError):
         return None
+
+
+def estimated_in_summary(map_: Path) -> tuple[bool, bool]:
+    """Return whether the poses and the calibrations of a map were estimated, as its summary says; else both were.
+
+    Tracking is given its calibration.
+    """
+    try:
+        told = read_document(map_ / "summary.json")
+        said = told.get("estimated")
+        if isinstance(said, dict):
+            return bool(said.get("poses", True)), bool(said.get("intrinsics", True))
+        return True, "sources" not in told
+    except (OSError, ValueError, AttributeError, GromaError):
+        return True, True

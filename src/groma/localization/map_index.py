@@ -31,6 +31,7 @@ from groma.io import atomic_output
 from groma.localization.features import Bytes, DescribedPoints, describe_places, find_points
 from groma.localization.matching import lengths_of
 from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.common_errors import CommonErrors, Responses, common_errors
 from groma.localization.pose.map_errors import SeenByImage, images_compared, shared_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.records import landmark_covariances, residual_squares
@@ -39,10 +40,10 @@ from groma.localization.retrieval import VladRetrieval
 from groma.localization.triangulation import triangulate_features
 from groma.mapping.lines.neighbors import covisible_neighbors
 from groma.mapping.photographs import read_gray
-from groma.scene import Scene
+from groma.scene import PointObservations, Points, Scene
 
 #: Of the format of the file; another one is built anew.
-_VERSION = 3
+_VERSION = 4
 #: Images that the features of an image are matched with (cost: time).
 _NEIGHBORS = 12
 
@@ -55,7 +56,9 @@ _FORMS = {
     **dict.fromkeys(("begin", "point", "segment_begin", "segment"), form("iu", None)),
     "pixel": form("f", None, 2), "descriptor": form("u", None, 128), "segment_descriptor": form("f", None, 72),
     "vocabulary": form("f", None, 128), "image": form("f", None, None),
-    "shared_error": form("f", 2), "unique": form("b", None),
+    "shared_error": form("f", 2), "unique": form("b", None), "common": form("f", None, None),
+    "point_seen": form("iu", None, 3), "point_motion": form("f", None, 3, None),
+    "line_seen": form("iu", None, 3), "line_motion": form("f", None, 6, None),
 }  # fmt: skip
 
 Progress = Callable[[str, int, int], None]
@@ -87,17 +90,34 @@ class MapIndex:
     shared_error: FloatArray = field(default_factory=lambda: np.zeros(2))
     #: (P,) points that look like no other place in the images that see them; where repeated things are, the others.
     unique: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
+    #: (n, n) covariance of the poses and calibrations of the map; none where they are exact, or not determined. For
+    #: each observation of points and of lines: landmark, frame and camera (., 3), and how the landmark follows these.
+    common: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    point_seen: IntArray = field(default_factory=lambda: np.zeros((0, 3), np.int64))
+    point_motion: npt.NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3, 6), np.float32))
+    line_seen: IntArray = field(default_factory=lambda: np.zeros((0, 3), np.int64))
+    line_motion: npt.NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 6, 6), np.float32))
 
     @cached_property
     def length(self) -> FloatArray:
         """(F,) lengths of the descriptors."""
         return lengths_of(self.descriptor)
 
+    def common_errors(self, scene: Scene) -> CommonErrors | None:
+        """Return the errors of poses and calibrations of the map; None where nothing is told of them."""
+        if not len(self.common):
+            return None
+        points, lines = Responses(self.point_seen, self.point_motion), Responses(self.line_seen, self.line_motion)
+        return CommonErrors(self.common, scene.num_frames, points, lines)
+
     @property
     def is_whole(self) -> bool:
         """Whether the arrays fit each other; those of a damaged file need not."""
         count, images = len(self.point), len(self.begin) - 1
-        told = (self.xyz, self.pixel, self.segment_descriptor, self.vocabulary, self.image, self.shared_error)
+        told = (
+            self.xyz, self.pixel, self.segment_descriptor, self.vocabulary, self.image, self.shared_error, self.common,
+            self.point_motion, self.line_motion,
+        )  # fmt: skip
         return (
             len(self.pixel) == len(self.descriptor) == count
             and len(self.segment_descriptor) == len(self.segment)
@@ -108,6 +128,10 @@ class MapIndex:
             and _divides(self.segment_begin, len(self.segment))
             and bool(((self.point >= 0) & (self.point < len(self.xyz))).all())
             and bool((self.segment >= 0).all() and (self.shared_error >= 0.0).all())
+            and self.common.shape[0] == self.common.shape[1]
+            and self.point_motion.shape[2] == self.line_motion.shape[2] >= 6
+            and _fit(self.point_seen, self.point_motion, len(self.xyz))
+            and _fit(self.line_seen, self.line_motion, len(self.line_covariance))
             and all(np.isfinite(part).all() for part in told)
         )
 
@@ -115,7 +139,10 @@ class MapIndex:
         """Whether the index can be one of a map."""
         counts = len(self.begin) - 1 == scene.num_images and len(self.line_covariance) == scene.num_lines
         inside = (self.segment < len(scene.line_observations)).all() and len(self.xyz) >= scene.num_points
-        return bool(counts and inside)
+        sizes = np.array([scene.num_frames, len(scene.cameras)])
+        told = len(self.common) in (0, sizes @ [6, self.point_motion.shape[2] - 6])
+        views = all((seen[:, 1:] < sizes).all() for seen in (self.point_seen, self.line_seen))
+        return bool(counts and inside and told and views)
 
     def write(self, path: Path, digest: str, folder: Path) -> None:
         """Write the index whole or not at all; ``digest`` is that of the map, ``folder`` holds its photographs."""
@@ -134,6 +161,13 @@ def read_index(path: Path, digest: str) -> MapIndex | None:
     except UNREADABLE:
         return None
     return found if found.is_whole else None
+
+
+def _fit(seen: IntArray, motion: npt.NDArray[np.float32], count: int) -> bool:
+    """Whether rows are of so many landmarks, in their order."""
+    landmark = seen[:, 0]
+    inside = len(seen) == len(motion) and (seen >= 0).all() and (landmark < count).all()
+    return bool(inside and (np.diff(landmark.astype(np.int64)) >= 0).all())
 
 
 def _divides(begin: IntArray, count: int) -> bool:
@@ -164,8 +198,10 @@ def digest_of(scene: Scene, files: Sequence[Path]) -> str:
     return told.hexdigest()
 
 
-def build_index(scene: Scene, files: Sequence[Path], say: Progress) -> MapIndex:
-    """Describe a map.
+def build_index(
+    scene: Scene, files: Sequence[Path], say: Progress, estimated: tuple[bool, bool] = (True, True)
+) -> MapIndex:
+    """Describe a map; ``estimated`` says whether its poses and its calibrations were, else they are exact.
 
     Raises
     ------
@@ -211,8 +247,28 @@ def build_index(scene: Scene, files: Sequence[Path], say: Progress) -> MapIndex:
         unique=unique_points(described, begin, _longer_sides(scene), len(made.xyz) + scene.num_points),
     )
     sigma = np.concatenate(sigmas)
+    index = _with_common_errors(scene, index, sigma, (own_noise, line_noise), estimated)
     seen = [_seen_by(scene, index, image, sigma, line_noise) for image in images_compared(scene.num_images).tolist()]
     return replace(index, shared_error=shared_errors(seen, partial(say, "comparing images of the map with the rest")))
+
+
+def _with_common_errors(
+    scene: Scene, index: MapIndex, sigma: FloatArray, noise: tuple[float, float], estimated: tuple[bool, bool]
+) -> MapIndex:
+    """The index with what is known of errors of poses and calibrations."""
+    image = np.repeat(np.arange(scene.num_images), np.diff(index.begin))
+    described = scene.keep(points=[], lines=[], planes=[], directions=[]).replace(
+        points=Points.at(index.xyz),
+        point_observations=PointObservations.numbered(image, index.point, index.pixel, sigma),
+    )
+    found = common_errors(scene, described, noise, estimated)
+    if found is None:
+        return index
+    points, lines = found.points, found.lines
+    return replace(
+        index, common=found.covariance, point_seen=points.seen, point_motion=points.motion, line_seen=lines.seen,
+        line_motion=lines.motion,
+    )  # fmt: skip
 
 
 def _longer_sides(scene: Scene) -> FloatArray:
@@ -277,15 +333,17 @@ def _covariances(scene: Scene, kind: str) -> tuple[FloatArray, float]:
     return landmark_covariances(problem, kind, count) * noise**2, noise
 
 
-def kept_index(scene: Scene, files: Sequence[Path], path: Path | None, say: Progress) -> tuple[MapIndex, str]:
+def kept_index(
+    scene: Scene, files: Sequence[Path], path: Path | None, say: Progress, estimated: tuple[bool, bool] = (True, True)
+) -> tuple[MapIndex, str]:
     """Return the index of a map, from its file or built and kept there; and a sentence if it cannot be kept."""
     if path is None:
-        return build_index(scene, files, say), ""
-    digest = digest_of(scene, files)
+        return build_index(scene, files, say, estimated), ""
+    digest = f"{digest_of(scene, files)} {estimated}"
     index = read_index(path, digest)
     if index is not None and index.is_of(scene):
         return index, ""
-    index = build_index(scene, files, say)
+    index = build_index(scene, files, say, estimated)
     try:
         index.write(path, digest, _common_folder(scene, files))
     except OutputError as error:

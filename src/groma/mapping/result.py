@@ -116,6 +116,10 @@ class MapResult:
             "segments": self.outcomes,
             "explanation": self.explanation,
             "warnings": list(self.warnings),
+            "estimated": {
+                "poses": self.adjusted_with.refine_poses,
+                "intrinsics": bool(self.adjusted_with.refine_intrinsics),
+            },
             "diagnosis": None if diagnosis is None else diagnosis.to_dict(),
             "pose_uncertainty": None if diagnosis is None else self.pose_uncertainty(),
         }

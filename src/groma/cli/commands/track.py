@@ -95,6 +95,7 @@ def track(
     import shutil
 
     from groma.cli.shared.mapping import WRITING
+    from groma.features.images import one_opencv_thread
     from groma.io.sequences import open_sequence
     from groma.tracking.options import TrackOptions
     from groma.tracking.saved import FrameSource
@@ -105,6 +106,8 @@ def track(
     frames = open_sequence(
         sequence, camera=camera, depth_scale=depth_scale, stride=stride, max_frames=max_frames, kind=known
     )
+    if frames.camera.baseline is None:  # dense disparities of pairs pay for threads of their own
+        one_opencv_thread()
     source = FrameSource.of(sequence, camera, depth_scale=depth_scale, kind=known)
     options = TrackOptions(
         points=points, lines=lines, planes=planes, close_loops=loops, max_depth=max_depth, detector=line_detector

@@ -92,7 +92,7 @@ class AbsolutePose:
     #: (7,) [qx qy qz qw tx ty tz]; None where none was found.
     cam_from_world: FloatArray | None
     #: (6, 6) of the left twist: shift in scene units, turn in radians, in the axes of the camera, with respect to the
-    #: map as it is.
+    #: map. Errors of its poses and calibrations are in it (:mod:`groma.localization.pose.common_errors`).
     covariance: FloatArray | None
     #: (N,) and (M,) which matches agree.
     point_inliers: BoolArray
@@ -105,8 +105,6 @@ class AbsolutePose:
     sigma0: float = 1.0
     #: Another pose that fits about as well, where there is one.
     rival: FloatArray | None = None
-    #: Cells of the image, and lines, that agreed before more matches were looked for where the pose says.
-    votes: int = 0
 
     @property
     def center(self) -> FloatArray | None:
@@ -195,6 +193,7 @@ def pose_from_matches(
     mirror: MirrorQuestions | None = None,
     expected: Callable[[Refined], tuple[tuple[float, float], float]] | None = None,
     enough: int = 0,
+    common: Callable[[Refined, Matches], FloatArray] | None = None,
 ) -> AbsolutePose:
     """Estimate a pose as :func:`estimate_absolute_pose` does.
 
@@ -214,6 +213,8 @@ def pose_from_matches(
         what only this place has is found, as a share of how often all of it is.
     enough
         A pose with fewer votes is of no interest: it is ``failed``, without asking what else speaks against it.
+    common : callable, optional
+        Returns what errors of the poses and calibrations of the map add to the covariance.
     """
     options = options or PoseOptions()
     best = _best(camera, matches, options)
@@ -233,6 +234,8 @@ def pose_from_matches(
         return _failed(camera, matches)
     other = None if rival_of is None else _rival(matches, rival_of[0], options, places, rival_of[1])
     covariance = best.covariance(used)
+    if common is not None and np.isfinite(covariance).all():
+        covariance = covariance + common(best, used)
     distance = median_distance(best.pose, _seen(used, best))
     verdict = judge(best, covariance, distance, first, None if other is None else other[1])
     if verdict.status == "localized":
@@ -258,7 +261,6 @@ def pose_from_matches(
         used,
         best.sigma0,
         None if other is None or verdict.status != "uncertain" else other[0].pose,
-        first.agree,
     )
 
 

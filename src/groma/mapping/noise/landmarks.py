@@ -88,12 +88,12 @@ class LineNoise:
         blocks = self.covariance[rows].reshape(-1, 2, 2, 2, 2)
         return np.einsum("ne,neafb,nf->nab", first, blocks, second)
 
-    def ends(self) -> FloatArray:
-        """Covariances (L, 2, 3, 3) of the end points, with as much uncertainty along the line as across."""
-        blocks = self.covariance.reshape(-1, 2, 2, 2, 2)
+    def ends(self, rows: IntArray) -> FloatArray:
+        """Covariances (N, 2, 3, 3) of the end points of some lines, with as much uncertainty along them as across."""
+        blocks, across = self.covariance[rows].reshape(-1, 2, 2, 2, 2), self.across[rows]
         blocks = np.stack([blocks[:, 0, :, 0], blocks[:, 1, :, 1]], axis=1)
-        full = np.einsum("lai,leab,lbj->leij", self.across, blocks, self.across)
-        along = cross(self.across[:, 0], self.across[:, 1])
+        full = np.einsum("lai,leab,lbj->leij", across, blocks, across)
+        along = cross(across[:, 0], across[:, 1])
         size = 0.5 * np.trace(blocks, axis1=2, axis2=3)
         return full + size[..., None, None] * (along[:, :, None] * along[:, None, :])[:, None]
 

@@ -198,7 +198,7 @@ def _planes_in(
         marks.points[points],
         marks.point_noise.covariance[points],
         marks.segments[lines],
-        marks.line_noise.ends()[lines],
+        marks.line_noise.ends(lines),
         options.planes,
         position[line_of_point[points]],
         progress,

@@ -1,25 +1,49 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What lies on planes, and planes whose members deviate fitted to these members.
+"""What lies on planes, planes whose members deviate fitted to these members, and pieces of rough walls joined.
 
 The search for planes finds where features lie on a plane within their noise: of a rough wall some panel, or a plane
 that cuts through several. How far members of the wall deviate is estimated afterwards, around that plane. A plane
 fitted to the members with this deviation in their noise is the one of most likelihood, and tells again what its members
 are.
+
+Of a rough wall several such planes may have been found. Planes beside one with more members, within the layer in which
+members are told from clutter, are tried as pieces of one wall where members of one of them deviate: a plane is fitted
+to the members of all, with the deviation in their noise. Of what it is fitted to, those pieces stay of which most is on
+it then, by the same tests. Planes whose own noise explains them are not joined to each other: nothing says that they
+are parts of something rough. What is on one piece deviates alike, so the covariance of such a plane counts pieces, not
+features. Steps of a stepped wall are no pieces of one: the plane through them is turned against each. So the normal of
+the whole has to be that of the piece with most members, by both covariances.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from groma._typing import FloatArray
-from groma.estimators.plane_fit import fit_plane
-from groma.estimators.plane_search import PlaneSet
-from groma.mapping.structure.relations import Landmarks, Pairs, on_planes
+from groma._typing import FloatArray, IntArray
+from groma.estimators.plane_fit import fit_plane, plane_motions
+from groma.estimators.plane_search import PlaneSet, connected_to
+from groma.gates import chi_square_gate, gate
+from groma.geometry.algebra import perpendicular
+from groma.mapping.structure.relations import Landmarks, Pairs, RelationGates, on_planes
 
 #: Rounds in which planes are fitted to members and members told again (cost: time; the second moves planes little).
 _ROUNDS = 2
+
+#: What counts as beside a plane.
+_RELATIONS = RelationGates()
+#: Planes, and the points and the lines on them.
+_Told = tuple[PlaneSet, Pairs, Pairs]
+
+
+@dataclass(frozen=True)
+class RoughGates:
+    """What makes a plane a piece of another one's wall."""
+
+    part: float = gate(0.5, "share", "of the members of a piece that are on the whole", "convention: more than half")
 
 
 def on_fitted_planes(
@@ -37,16 +61,196 @@ def on_fitted_planes(
         As :func:`~groma.mapping.structure.relations.on_planes` has them.
     min_support : int
         Least number of members of a plane that is fitted, a segment counts as two; planes with fewer stay.
+
+    Returns
+    -------
+    planes : PlaneSet
+        Those that are pieces of one rough wall are one, in the place of the one with most members.
+    points, lines : Pairs
+        What lies on them.
     """
+    fitted = partial(_fitted_in_turn, marks, level=level, least=least, min_support=min_support)
+    found = fitted(planes)
+    into, joined = _joined(marks, *found, fitted, level)
+    if joined is found[0]:
+        return found
+    planes, points, lines = fitted(joined)
+    return _with_shared_deviations(marks, planes, points, lines, found[1:], into), points, lines
+
+
+def _fitted_in_turn(
+    marks: Landmarks, planes: PlaneSet, level: float, least: tuple[float, float], min_support: int
+) -> _Told:
+    """Tell members of planes and fit planes to them in turn."""
     points, lines = on_planes(marks, planes, level, least)
     for _ in range(_ROUNDS):
         rough = _deviations(points, lines, len(planes))
-        rough[points.counts(len(planes)) + 2 * lines.counts(len(planes)) < min_support] = 0.0
+        rough[_num_members(points, lines, len(planes)) < min_support] = 0.0
         if not rough.any():
             break
         planes = _fitted(marks, planes, points, lines, rough)
         points, lines = on_planes(marks, planes, level, least)
     return planes, points, lines
+
+
+def _joined(
+    marks: Landmarks, planes: PlaneSet, points: Pairs, lines: Pairs, fitted: Callable[[PlaneSet], _Told], level: float
+) -> tuple[IntArray, PlaneSet]:
+    """Into which plane each goes, and the planes with pieces of rough walls joined: the same ones where none are."""
+    num = len(planes)
+    rough, members = _deviations(points, lines, num), _num_members(points, lines, num)
+    free = members > 0
+    groups: list[list[int]] = []
+    wholes: list[PlaneSet] = []
+    for k in np.argsort(-members, kind="stable").tolist():
+        if not free[k]:
+            continue
+        free[k] = False  # a piece has fewer members than what it is a piece of
+        group = _beside(marks, planes, points, lines, k, free) if rough[k] or rough[free].any() else [k]
+        if not rough[group].any():
+            continue
+        whole, group = _whole(marks, planes, points, lines, group, rough[group].max(), fitted, level)
+        if len(group) > 1:
+            groups.append(group)
+            wholes.append(whole)
+            free[group] = False
+    return _with_wholes(planes, groups, wholes)
+
+
+def _beside(
+    marks: Landmarks,
+    planes: PlaneSet,
+    points: Pairs,
+    lines: Pairs,
+    first: int,
+    free: np.ndarray,
+    gates: RelationGates = _RELATIONS,
+) -> list[int]:
+    """A plane, then those in its layer that are connected with it, directly or by others of them."""
+    plane = planes.planes[first]
+    turned = np.arccos(np.clip(np.abs(planes.planes[:, :3] @ plane[:3]), 0.0, 1.0))
+    near = [
+        b
+        for b in np.flatnonzero(free & (turned < gates.competing)).tolist()
+        if np.median(np.abs(planes.places[b] @ plane[:3] + plane[3])) < gates.layer * planes.band[first]
+    ]
+    group, reached = [first], [first]
+    while reached:
+        places = np.concatenate([planes.places[b] for b in group])
+        reached = [b for b in near if connected_to(places, *_features(marks, points, lines, b), plane).any()]
+        group += reached
+        near = [b for b in near if b not in reached]
+    return group
+
+
+def _whole(
+    marks: Landmarks,
+    planes: PlaneSet,
+    points: Pairs,
+    lines: Pairs,
+    group: list[int],
+    rough: float,
+    fitted: Callable[[PlaneSet], _Told],
+    level: float,
+    gates: RoughGates = RoughGates(),
+) -> tuple[PlaneSet, list[int]]:
+    """One plane for those of a group that are pieces of it, and which these are: the first alone if there are none.
+
+    The first fit takes members to deviate by ``rough``, pixels.
+    """
+    whole = planes
+    while len(group) > 1:
+        new = np.full(len(planes), -1)
+        new[group] = 0
+        of_group = points.renumbered(new), lines.renumbered(new)
+        whole = _fitted(marks, _as_one(planes, group), *of_group, np.array([rough]))
+        whole, *found = fitted(whole)
+        on_whole = found[0], found[1]
+        parts = [_share(points, lines, b, *on_whole) > gates.part for b in group]
+        if all(parts) and _deviations(*on_whole, 1)[0]:
+            known = _with_shared_deviations(marks, whole, *on_whole, (points, lines), np.where(new < 0, 1, 0))
+            if _same_normal(known, 0, planes, group[0], level):
+                break
+            return whole, group[:1]
+        group = [b for b, part in zip(group, parts, strict=True) if part] if parts[0] and not all(parts) else group[:1]
+    return whole, group
+
+
+def _same_normal(one: PlaneSet, first: int, other: PlaneSet, second: int, level: float) -> bool:
+    """Whether two planes have one normal, as far as their covariances tell (chi-square test)."""
+    normal = one.planes[first, :3]
+    basis = np.stack(perpendicular(normal))
+    off = basis @ other.planes[second, :3]
+    noise = basis @ (one.covariance[first, :3, :3] + other.covariance[second, :3, :3]) @ basis.T
+    return float(off @ np.linalg.solve(noise, off)) < chi_square_gate(1.0 - level, 2)
+
+
+def _as_one(planes: PlaneSet, group: list[int]) -> PlaneSet:
+    """The first plane of a group with all that the group has; what other planes have is theirs."""
+    label = np.ones(len(planes) + 1, np.int64)
+    label[group], label[-1] = 0, -1
+    first = group[:1]
+    return PlaneSet(
+        planes.planes[first],
+        planes.covariance[first],
+        planes.support[group].sum(keepdims=True),
+        planes.share[first],
+        planes.band[first],
+        planes.log10_false_alarms[first],
+        label[planes.point_label],
+        label[planes.segment_label],
+        [np.concatenate([planes.places[b] for b in group])],
+    )
+
+
+def _with_wholes(planes: PlaneSet, groups: list[list[int]], wholes: list[PlaneSet]) -> tuple[IntArray, PlaneSet]:
+    """The new number of each plane, and the planes with each group replaced by its whole, where its first was."""
+    if not groups:
+        return np.arange(len(planes)), planes
+    into, plane, covariance = np.arange(len(planes)), planes.planes.copy(), planes.covariance.copy()
+    support, places = planes.support.copy(), list(planes.places)
+    for group, whole in zip(groups, wholes, strict=True):
+        first = group[0]
+        into[group], plane[first], covariance[first] = first, whole.planes[0], whole.covariance[0]
+        support[first], places[first] = whole.support[0], whole.places[0]
+    rows = np.unique(into)
+    new = np.searchsorted(rows, into)
+    label = np.append(new, -1)
+    return new, PlaneSet(
+        plane[rows],
+        covariance[rows],
+        support[rows],
+        planes.share[rows],
+        planes.band[rows],
+        planes.log10_false_alarms[rows],
+        label[planes.point_label],
+        label[planes.segment_label],
+        [places[row] for row in rows],
+    )
+
+
+def _features(marks: Landmarks, points: Pairs, lines: Pairs, plane: int) -> tuple[FloatArray, FloatArray]:
+    """(M, 3) points and segment ends on a plane, and (M,) the distances at which they have their neighbours."""
+    point, line = points.pairs[points.pairs[:, 1] == plane, 0], lines.pairs[lines.pairs[:, 1] == plane, 0]
+    return (
+        np.concatenate([marks.points[point], marks.segments[line].reshape(-1, 3)]),
+        np.concatenate([marks.point_spacing[point], marks.end_spacing[line].ravel()]),
+    )
+
+
+def _share(points: Pairs, lines: Pairs, plane: int, whole_points: Pairs, whole_lines: Pairs) -> float:
+    """Share of the members of a plane that are on the whole; a line counts as its two ends."""
+    number = right = 0
+    for weight, mine, whole in ((1, points, whole_points), (2, lines, whole_lines)):
+        own = mine.pairs[mine.pairs[:, 1] == plane, 0]
+        number += weight * len(own)
+        right += weight * int(np.isin(own, whole.pairs[:, 0]).sum())
+    return right / max(number, 1)
+
+
+def _num_members(points: Pairs, lines: Pairs, num: int) -> np.ndarray:
+    """(num,) members of each plane; a line counts as its two ends."""
+    return points.counts(num) + 2 * lines.counts(num)
 
 
 def _deviations(points: Pairs, lines: Pairs, num: int) -> FloatArray:
@@ -59,16 +263,61 @@ def _deviations(points: Pairs, lines: Pairs, num: int) -> FloatArray:
 
 def _fitted(marks: Landmarks, planes: PlaneSet, points: Pairs, lines: Pairs, rough: FloatArray) -> PlaneSet:
     """Return the planes with a deviation fitted to their members, weighted by their probabilities."""
-    plane, covariance, ends = planes.planes.copy(), planes.covariance.copy(), marks.line_noise.ends()
-    for k in np.flatnonzero(rough):
-        of_points, of_lines = points.pairs[:, 1] == k, lines.pairs[:, 1] == k
-        point, line = points.pairs[of_points, 0], lines.pairs[of_lines, 0]
-        noise = np.concatenate([marks.point_noise.covariance[point], ends[line].reshape(-1, 3, 3)])
-        away = rough[k] * np.concatenate([marks.point_pixel[point], np.repeat(marks.line_pixel[line], 2)])
-        fit = fit_plane(
-            np.concatenate([marks.points[point], marks.segments[line].reshape(-1, 3)]),
-            noise + away[:, None, None] ** 2 * np.eye(3),
-            np.concatenate([points.probability[of_points], np.repeat(lines.probability[of_lines], 2)]),
-        )
+    plane, covariance = planes.planes.copy(), planes.covariance.copy()
+    for k in np.flatnonzero(rough).tolist():
+        places, noise, away, weight = _members_of(marks, points, lines, k, rough[k])
+        fit = fit_plane(places, noise + away[:, None, None] ** 2 * np.eye(3), weight)
         plane[k], covariance[k] = fit.plane * np.sign(fit.plane[:3] @ plane[k, :3]), fit.covariance
     return replace(planes, planes=plane, covariance=covariance)
+
+
+def _members_of(
+    marks: Landmarks, points: Pairs, lines: Pairs, plane: int, rough: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Points and segment ends on a plane: places (M, 3), covariances, deviations ``rough`` as lengths, weights."""
+    of_points, of_lines = points.pairs[:, 1] == plane, lines.pairs[:, 1] == plane
+    point, line = points.pairs[of_points, 0], lines.pairs[of_lines, 0]
+    return (
+        np.concatenate([marks.points[point], marks.segments[line].reshape(-1, 3)]),
+        np.concatenate([marks.point_noise.covariance[point], marks.line_noise.ends(line).reshape(-1, 3, 3)]),
+        rough * np.concatenate([marks.point_pixel[point], np.repeat(marks.line_pixel[line], 2)]),
+        np.concatenate([points.probability[of_points], np.repeat(lines.probability[of_lines], 2)]),
+    )
+
+
+def _with_shared_deviations(
+    marks: Landmarks, planes: PlaneSet, points: Pairs, lines: Pairs, before: tuple[Pairs, Pairs], into: IntArray
+) -> PlaneSet:
+    """Return the planes, the joined ones with the covariance that they have if the members of a piece deviate alike.
+
+    ``before`` has the members of the pieces, ``into`` the planes that these are pieces of.
+    """
+    covariance, rough = planes.covariance.copy(), _deviations(points, lines, len(planes))
+    joined = np.bincount(into, minlength=len(planes))[: len(planes)] > 1
+    for k in np.flatnonzero(joined & (rough > 0.0)).tolist():
+        places, noise, away, weight = _members_of(marks, points, lines, k, rough[k])
+        piece = _pieces(points, lines, before, into, k)
+        normal = planes.planes[k, :3]
+        own = np.einsum("i,nij,j->n", normal, noise, normal)
+        precision = weight / (own + away**2)
+        slope, motion = plane_motions(planes.planes[k], precision @ places / precision.sum(), places)
+        alike = np.zeros((int(piece.max()) + 1, 3))
+        np.add.at(alike, piece, (precision * away)[:, None] * slope)
+        inverse = np.linalg.inv((precision[:, None] * slope).T @ slope)
+        inner = inverse @ ((precision**2 * own)[:, None] * slope).T @ slope @ inverse
+        covariance[k] = motion @ (inner + (alike @ inverse).T @ (alike @ inverse)) @ motion.T
+    return replace(planes, covariance=covariance)
+
+
+def _pieces(points: Pairs, lines: Pairs, before: tuple[Pairs, Pairs], into: IntArray, plane: int) -> IntArray:
+    """(M,) the piece that each point and segment end on a plane is on; those on none have numbers of their own."""
+    numbers, free = [], len(into)
+    for found, earlier, ends in ((points, before[0], 1), (lines, before[1], 2)):
+        mark = found.pairs[found.pairs[:, 1] == plane, 0]
+        piece = np.full(int(max(mark.max(initial=0), earlier.pairs[:, 0].max(initial=0))) + 1, -1)
+        rows = into[earlier.pairs[:, 1]] == plane
+        piece[earlier.pairs[rows, 0]] = earlier.pairs[rows, 1]
+        number = np.where(piece[mark] >= 0, piece[mark], free + np.arange(len(mark)))
+        numbers.append(np.repeat(number, ends))
+        free += len(mark)
+    return np.concatenate(numbers)

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from groma._typing import FloatArray, IntArray
 from groma.features.depth.noise import DepthNoise
 from groma.features.depth.points import depth_at
+from groma.features.edge_fit import SmoothImage, smoothed
 from groma.features.images import GrayImage
 from groma.features.point_tracks import corners
 from groma.features.segments import Segments
@@ -167,6 +168,11 @@ class FrameFeatures:
             if not future.cancel():
                 future.result()
         self._work.clear()
+
+    @_FoundOnce
+    def smooth(self) -> SmoothImage:
+        """The image in which edges are measured."""
+        return smoothed(self.gray)
 
     @_FoundOnce
     def small(self) -> SmallImage:

@@ -17,7 +17,7 @@ import numpy as np
 from groma._numba import loop
 from groma._rows import Rows, column
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.features.edge_fit import measure_edges
+from groma.features.edge_fit import SmoothImage, measure_smoothed
 from groma.features.images import GrayImage
 from groma.features.matching.flow import Flow
 from groma.geometry import quaternion, se3, segment2
@@ -103,13 +103,13 @@ def carried(
 
 
 def measured_edges(
-    image: GrayImage, guess: FloatArray, strength: FloatArray, gates: LineGates
+    smooth: SmoothImage, guess: FloatArray, strength: FloatArray, gates: LineGates
 ) -> tuple[FollowedSegments, IntArray]:
-    """Fit guessed segments to the image; keep those with an edge of the right sign and like strength.
+    """Fit guessed segments to the smoothed image; keep those with an edge of the right sign and like strength.
 
     Returns the segments (their index is the row of the guess), and those rows.
     """
-    ends, sigma, found = measure_edges(image, guess)
+    ends, sigma, found = measure_smoothed(smooth, guess)
     same_way = ((ends[:, 2:] - ends[:, :2]) * (guess[:, 2:] - guess[:, :2])).sum(axis=1) > 0
     good = same_way & (sigma < gates.max_sigma) & (found > gates.min_strength)
     good &= (found > gates.weaker * strength) & (found < gates.stronger * strength)

@@ -68,15 +68,16 @@ def follow_frame(
         measured = measure_points(data, tracks.take(alive), options, track_map, predicted, camera)
         if not options.points:
             measured = PointMeasurements.empty()
+    # Planes before lines: where the thread beside is still busy with lines, this one finds the planes meanwhile.
+    with watch("planes"):
+        planes = PlaneMeasurements.empty()
+        if planes_found() is not None:
+            planes = match_planes(track_map, data, predicted, gates.planes.wide_angle, gates.planes.wide_distance)
     with watch("lines"):
         lines = LineMeasurements.empty()
         if with_lines:
             segments = lines_followed()
             lines = measure_lines(track_map, data, segments, few_points=len(measured) < gates.lines.few_points)
-    with watch("planes"):
-        planes = PlaneMeasurements.empty()
-        if planes_found() is not None:
-            planes = match_planes(track_map, data, predicted, gates.planes.wide_angle, gates.planes.wide_distance)
     if len(measured) + 2 * len(lines) + 3 * len(planes) < gates.verification.min_followed:
         return None, Followed.nothing()
     with watch("pose"):
@@ -152,7 +153,7 @@ def follow_lines(
     agree &= track_map.lines.state[segments.index] != DEAD
     guess, good = _inside(guess, data.gray.shape, gates.min_length)
     rows = np.flatnonzero(agree & good)
-    found, of = measured_edges(data.gray, guess[rows], segments.strength[rows], gates)
+    found, of = measured_edges(data.smooth, guess[rows], segments.strength[rows], gates)
     kept = rows[of]
     return FollowedSegments(segments.index[kept], found.ends, found.sigma, found.strength)
 
@@ -205,7 +206,7 @@ def find_lines_again(track_map: TrackMap, data: FrameFeatures, pose: FloatArray,
     rows, expected = rows[seen][-room:], expected[seen][-room:]
     if not len(rows):
         return followed
-    found, of = measured_edges(data.gray, expected, lines.strength[rows], gates)
+    found, of = measured_edges(data.smooth, expected, lines.strength[rows], gates)
     away = np.abs(found.ends - expected[of]).max(axis=1)
     good = away < gates.again_distance
     new = FollowedSegments(rows[of[good]], found.ends[good], found.sigma[good], found.strength[good])

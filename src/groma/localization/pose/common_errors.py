@@ -1,0 +1,268 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""What is wrong with a whole map: errors of its poses and calibrations, and of a query's pose by them.
+
+The covariance of a landmark is that with poses and calibrations of the map held. These were estimated, too. An error
+:math:`\delta\theta` of them moves each landmark, which stays where its observations say,
+
+.. math:: \delta X = -V^{-1} \sum_o J_{X,o}^\top W_o J_{\theta,o}\, \delta\theta, \qquad
+          V = \sum_o J_{X,o}^\top W_o J_{X,o},
+
+and all landmarks of a query at once: nothing is averaged out. What the query is off by then is, with its information
+:math:`H` and derivatives by its own unknowns :math:`J_q`,
+
+.. math:: \delta q = -H^{-1} \sum_i J_{q,i}^\top W_i (J_{X,i}\, \delta X_i + J_{c,i}\, \delta c) = K\, \delta\theta ,
+
+where :math:`\delta c` is there if the query has the calibration of a camera of the map, whose error it shares. Its
+covariance grows by :math:`K \Sigma_\theta K^\top`. :math:`\Sigma_\theta` is that of the adjustment of the map by its
+points and lines, landmarks eliminated, in the frame in which the camera centres vary least together: errors of a query
+are relative to the map. What the observations do not know, such as a lens of another model, is not in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from groma._typing import FloatArray, IntArray
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
+from groma.adjustment.stages import STAGES, with_loss
+from groma.errors import ProblemError
+from groma.factors.contract import Factor
+from groma.factors.losses import GemanMcClure
+from groma.gates import gate
+from groma.localization.pose.matches import Matches
+from groma.localization.pose.pose_problem import problem_of
+from groma.localization.pose.records import landmark_rows, motions_of_lines, records, times
+from groma.localization.pose.refinement import Refined, landmark_weights, last_scale
+from groma.scene import Relations, Scene
+from groma.solver.covariance.marginals import Covariances
+
+
+@dataclass(frozen=True)
+class CommonErrorGates:
+    """Of which maps common errors are told."""
+
+    unknowns: int = gate(
+        4000, "unknowns", "of poses and calibrations at most; of larger maps nothing is told", "cost: their square"
+    )
+    loss: float = gate(3.0, "sigma", "scale of the Geman-McClure loss of its landmarks", "convention: three sigma")
+
+
+GATES = CommonErrorGates()
+
+
+@dataclass(frozen=True, eq=False)
+class Responses:
+    """How landmarks follow errors of poses and calibrations, one row an observation, in the order of the landmarks."""
+
+    #: (N, 3) landmark, frame and camera.
+    seen: IntArray
+    #: (N, m, 6 + p) motion of the landmark by the left twist of the frame and the parameters of the camera: points in
+    #: space, lines as (moment, direction).
+    motion: npt.NDArray[np.float32]
+
+    @cached_property
+    def begin(self) -> IntArray:
+        """Where the rows of each landmark begin, and end."""
+        return np.concatenate([[0], np.cumsum(np.bincount(self.seen[:, 0], minlength=1))]).astype(np.int64)
+
+    def of(self, landmarks: IntArray) -> tuple[IntArray, IntArray]:
+        """Return rows of some landmarks, and for each the place of its landmark among them."""
+        known = np.minimum(landmarks, len(self.begin) - 2)
+        count = np.where(known == landmarks, self.begin[known + 1] - self.begin[known], 0)
+        place = np.repeat(np.arange(len(landmarks)), count)
+        within = np.arange(len(place)) - np.repeat(np.cumsum(count) - count, count)
+        return np.repeat(self.begin[known], count) + within, place
+
+
+@dataclass(frozen=True, eq=False)
+class CommonErrors:
+    """Errors of the poses and calibrations of a map."""
+
+    #: (n, n) of the left twists of all frames, then of the parameters of all cameras, so many of each.
+    covariance: FloatArray
+    frames: int
+    points: Responses
+    lines: Responses
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters of each camera that have errors."""
+        return self.points.motion.shape[2] - 6
+
+    def of_query(
+        self, refined: Refined, matches: Matches, landmarks: tuple[IntArray, IntArray], camera: int | None = None
+    ) -> FloatArray:
+        """Return what they add to the covariance (6, 6) of the pose of a query.
+
+        Parameters
+        ----------
+        refined, matches
+            The pose, and what it was fitted to.
+        landmarks
+            Points (N,) and lines (M,) of the map that the matches are of.
+        camera
+            The camera of the map whose calibration the query has.
+        """
+        kept = refined.point_inliers, refined.line_inliers
+        J = np.concatenate([refined.points.by_pose[kept[0]], refined.lines.by_pose[kept[1]]])
+        r = np.concatenate([refined.points.value[kept[0]], refined.lines.value[kept[1]]])
+        weight = (1.0 + (r**2).sum(axis=1) / last_scale(len(r)) ** 2) ** -2
+        pull = weight[:, None, None] * np.swapaxes(J, 1, 2)
+        some = matches.take(*kept)
+        problem = problem_of(refined.camera, some, refined.pose, J.shape[2] > 6)
+        K = np.zeros((len(self.covariance), J.shape[2]))
+        for factor, white in zip(problem.factors, landmark_weights(problem, some), strict=True):
+            for kind, own, begin in (("points", self.points, 0), ("lines", self.lines, some.num_points)):
+                at = landmark_rows(factor, kind)
+                if at is None:
+                    continue
+                row = int(kind == "lines")
+                wanted = {kind[:-1]: own.motion.shape[1]}
+                by_landmark = pull[begin + at] @ white @ records(problem, factor, wanted)[..., :-1]
+                self._add(K, own, landmarks[row][kept[row]][at], by_landmark)
+                if camera is not None and self.parameters and _has(factor, "intrinsics"):
+                    first = 6 * self.frames + camera * self.parameters
+                    by_lens = white @ records(problem, factor, {"intrinsics": len(refined.camera.params)})[..., :-1]
+                    K[first : first + by_lens.shape[2]] += np.einsum("nik,nkj->ji", pull[begin + at], by_lens)
+        H = np.einsum("nik,nkj->ij", pull, J)
+        scale = 1.0 / np.sqrt(np.diag(H))
+        step = (K * scale) @ np.linalg.inv(H * np.outer(scale, scale)) * scale
+        return (step.T @ self.covariance @ step)[:6, :6]
+
+    def _add(self, K: FloatArray, own: Responses, landmarks: IntArray, by_landmark: FloatArray) -> None:
+        """Add to K what landmarks (n,) do that pull (n, d, m) at a query, view by view of the map."""
+        rows, place = own.of(landmarks)
+        if not len(rows):
+            return
+        cameras = int(own.seen[:, 2].max()) + 1
+        view = own.seen[rows, 1] * cameras + own.seen[rows, 2]
+        order = np.argsort(view, kind="stable")
+        first = np.flatnonzero(np.diff(view[order], prepend=-1))
+        moved = by_landmark[place[order]] @ own.motion[rows[order]]
+        for total, number in zip(np.add.reduceat(moved, first), view[order][first].tolist(), strict=True):
+            frame, camera = divmod(number, cameras)
+            K[6 * frame : 6 * frame + 6] += total[:, :6].T
+            begin = 6 * self.frames + camera * self.parameters
+            K[begin : begin + self.parameters] += total[:, 6:].T
+
+
+def common_errors(
+    scene: Scene, described: Scene, noise: tuple[float, float], estimated: tuple[bool, bool],
+    gates: CommonErrorGates = GATES,
+) -> CommonErrors | None:  # fmt: skip
+    """Return the common errors of a map; None where it has none, or does not determine them, or is too large.
+
+    Parameters
+    ----------
+    scene
+        The map as it was adjusted.
+    described
+        The same poses, with the points that queries are matched with.
+    noise
+        Of its points and lines, in units of what is stated.
+    estimated
+        Whether its poses and its calibrations were estimated; else they are exact.
+    gates
+        How large it may be.
+    """
+    count = max(len(row) for row in _params(scene)) if estimated[1] else 0
+    if not any(estimated) or 6 * scene.num_frames + count * len(scene.cameras) > gates.unknowns:
+        return None
+    bare = scene.keep(planes=[], directions=[])
+    seen, lines = bare.point_observations, bare.line_observations
+    bare = bare.replace(
+        point_observations=seen.replace(sigma=seen.sigma * noise[0]),
+        line_observations=lines.replace(sigma=lines.sigma * noise[1]),
+        relations=Relations(),
+    )
+    options = AssemblyOptions(refine_poses=estimated[0], refine_intrinsics=estimated[1], gauge="free")
+    try:
+        problem = with_loss(assemble(bare, options).problem, GemanMcClure(STAGES.last_scale))
+        datum = {"frames": [1, 1, 1, 0, 0, 0]} if estimated[0] else None
+        found = Covariances(problem, "inner" if estimated[0] else "held", datum=datum)
+        covariance = found.joint(_variables(scene, estimated[1]))
+    except ProblemError:
+        return None
+    if estimated[1]:
+        covariance = _padded(covariance, scene, count)
+    parts = [_responses(described.keep(lines=[], planes=[], directions=[]), "points", count)]
+    parts.append(_responses(bare.keep(points=[]), "lines", count))
+    return CommonErrors(np.nan_to_num(covariance), scene.num_frames, *parts)
+
+
+def _params(scene: Scene) -> list[FloatArray]:
+    return [scene.cameras.params_of(row) for row in range(len(scene.cameras))]
+
+
+def _variables(scene: Scene, calibrations: bool) -> list[tuple[str, int]]:
+    """Names and numbers of the frames of a problem, and of its cameras in the order of the scene."""
+    found = [("frames", row) for row in range(scene.num_frames)]
+    if calibrations:
+        place = _places(scene)
+        found += [(f"intrinsics/{model}", int(place[row])) for row, model in enumerate(scene.cameras.models)]
+    return found
+
+
+def _places(scene: Scene) -> IntArray:
+    """Number (C,) of each camera among those of its model."""
+    place = np.zeros(len(scene.cameras), np.int64)
+    for members in scene.cameras.by_model().values():
+        place[members] = np.arange(len(members))
+    return place
+
+
+def _padded(covariance: FloatArray, scene: Scene, count: int) -> FloatArray:
+    """The same with as many parameters for each camera."""
+    first, sizes = 6 * scene.num_frames, [len(row) for row in _params(scene)]
+    rows = [np.arange(first)]
+    rows += [first + number * count + np.arange(size) for number, size in enumerate(sizes)]
+    into = np.concatenate(rows)
+    out = np.zeros((first + count * len(sizes),) * 2)
+    out[np.ix_(into, into)] = covariance
+    return out
+
+
+def _has(factor: Factor, name: str) -> bool:
+    return any(slot.name == name for slot, _ in factor.references())
+
+
+def _responses(scene: Scene, kind: str, parameters: int, gates: CommonErrorGates = GATES) -> Responses:
+    """How the landmarks of one kind follow errors of poses, and of so many parameters of each camera."""
+    size, total = (3 if kind == "points" else 6), len(getattr(scene, kind))
+    options = AssemblyOptions(refine_intrinsics=True, drop_behind=False, point_chart="euclidean", gauge="free")
+    problem = assemble(scene, options).problem
+    free = np.broadcast_to(np.eye(3), (total, 3, 3))
+    if kind == "lines" and total:
+        free = motions_of_lines(problem.variables[kind].ambient()[:total])
+    cameras = {f"intrinsics/{name}": rows for name, rows in scene.cameras.by_model().items()}
+    V, parts = np.zeros((total, free.shape[2], free.shape[2])), []
+    for factor in problem.factors:
+        landmark = landmark_rows(factor, kind)
+        if landmark is None:
+            continue
+        refs = {slot.name: ref for slot, ref in factor.references()}
+        lens = refs.get("intrinsics") if parameters else None
+        count = 0 if lens is None else problem.variables[lens.group].state.shape[1]
+        wanted = {"pose": 6, **({"intrinsics": count} if count else {}), kind[:-1]: size}
+        white = times(factor.sqrt_information, records(problem, factor, wanted))
+        weight = (1.0 + (white[..., -1] ** 2).sum(axis=1) / gates.loss**2) ** -2
+        J = white[..., 6 + count : -1] @ free[landmark]
+        np.add.at(V, landmark, np.einsum("n,nki,nkj->nij", weight, J, J))
+        by_view = np.zeros((len(factor), free.shape[2], 6 + parameters))
+        by_view[..., : 6 + count] = np.einsum("n,nki,nkj->nij", weight, J, white[..., : 6 + count])
+        camera = np.zeros(len(factor), np.int64) if lens is None else cameras[lens.group][lens.index]
+        parts.append((landmark, refs["pose"].index, camera, by_view))
+    if not parts:
+        return Responses(np.zeros((0, 3), np.int64), np.zeros((0, size, 6 + parameters), np.float32))
+    landmark, frame, camera, by_view = (np.concatenate(part) for part in zip(*parts, strict=True))
+    values = np.linalg.eigvalsh(V)
+    good = (values[:, 0] > 1e-12 * values[:, -1])[landmark]
+    order = np.flatnonzero(good)[np.argsort(landmark[good], kind="stable")]
+    seen = np.column_stack([landmark, frame, camera])[order].astype(np.int64)
+    motion = -free[seen[:, 0]] @ np.linalg.solve(V[seen[:, 0]], by_view[order])
+    return Responses(seen, motion.astype(np.float32))
