@@ -19,7 +19,7 @@ from groma.io import read_scene, write_scene
 from groma.localization import extension
 from groma.localization.calibration import CalibrationChoice
 from groma.localization.extension import extended_model
-from groma.localization.joining.merging import GATES, _line_sigma, _one_to_one, _same_lines, merged_model
+from groma.localization.joining.merging import _line_sigma, _one_to_one, _same_lines, merged_model
 from groma.localization.localizer import Localizer
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.posed_model import gather_photographs
@@ -175,7 +175,7 @@ def test_segments_that_show_one_line_are_paired():
     seen = SimpleNamespace(image_idx=np.array([4, 4, 4]), line_idx=np.array([7, 8, 9]), segment=observed)
     pose = SimpleNamespace(line_inliers=np.ones(4, bool), matches=SimpleNamespace(segments2d=query))
     found = SimpleNamespace(pose=pose, line=np.array([30, 31, 32, 33]))
-    pairs = _same_lines(SimpleNamespace(scene=SimpleNamespace(line_observations=seen)), 4, found, GATES)
+    pairs = _same_lines(SimpleNamespace(scene=SimpleNamespace(line_observations=seen)), 4, found)
     assert pairs.tolist() == [[7, 30], [8, 31]]
 
 
