@@ -23,7 +23,7 @@ def align(
     source: _options.Input,
     reference: Annotated[
         Path | None,
-        typer.Argument(metavar="[REFERENCE]", help="A scene with images of the same names, of any format."),
+        typer.Argument(metavar="REFERENCE", help="A scene with images of the same names, of any format."),
     ] = None,
     output: Annotated[
         Path | None, _options.PLAIN.option("Folder or file for the moved scene.", "--output", "-o", metavar="OUT")

@@ -23,7 +23,7 @@ def poses(
     console: Console,
     estimate: Annotated[Path, typer.Argument(metavar="EST", help="Scene to judge.")],
     reference: Annotated[Path, typer.Argument(metavar="REF", help="Scene taken for true.")],
-    force: _options.Force = False,
+    force: _options.ForceReport = False,
 ) -> None:
     """Compare the camera poses of two scenes after similarity alignment; images are matched by name."""
     _output.check_json(console.json_target, force)
@@ -71,7 +71,7 @@ def lines(
     reference: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[REF]",
+            metavar="REF",
             help="Scene, line set or edge graph (.npz, .npy, .txt), mesh (.ply, .obj) or points taken for true.",
             show_default=False,
         ),
@@ -87,7 +87,7 @@ def lines(
     align: Annotated[
         bool, _options.PLAIN.option("First align EST to REF by the poses of images in both scenes.", "--align")
     ] = False,
-    force: _options.Force = False,
+    force: _options.ForceReport = False,
 ) -> None:
     """Compare 3D line segments with a reference: how much of it is covered, how much of the lines is right.
 
@@ -167,7 +167,7 @@ def planes(
     max_offset: Annotated[
         float | None, _options.PLAIN.option("Largest offset of planes that match; by default 1 % of REF.", metavar="D")
     ] = None,
-    force: _options.Force = False,
+    force: _options.ForceReport = False,
 ) -> None:
     """Compare planes with reference planes (angles and offsets of matches) or with points (share explained)."""
     _output.check_json(console.json_target, force)
@@ -223,7 +223,7 @@ def trajectory(
     ] = None,
     rpe_delta: Annotated[float, _options.PLAIN.option("Step of the relative errors.", metavar="D")] = 1.0,
     rpe_unit: Annotated[_StepUnit, _options.PLAIN.option("Unit of the step.")] = "frames",
-    force: _options.Force = False,
+    force: _options.ForceReport = False,
 ) -> None:
     """Compare a trajectory with a reference: absolute and relative errors, and drift; poses are matched by time.
 

@@ -51,7 +51,7 @@ def map_(
     ] = None,
     map_images: Annotated[
         Path | None,
-        _options.CAMERAS.option("With --extend: the photographs of MAP, where it does not tell.", metavar="FOLDER"),
+        _options.CAMERAS.option("With --extend: the photographs of MAP, if they are not found.", metavar="FOLDER"),
     ] = None,
     camera_model: Annotated[
         str | None,

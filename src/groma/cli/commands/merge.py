@@ -19,11 +19,11 @@ def merge(
     output: Annotated[Path, _options.PLAIN.option("Folder for the results.", "--output", "-o", metavar="OUT")],
     first_images: Annotated[
         Path | None,
-        _options.PLAIN.option("The photographs of A, where it does not tell.", "--images-a", metavar="FOLDER"),
+        _options.PLAIN.option("The photographs of A, if they are not found.", "--images-a", metavar="FOLDER"),
     ] = None,
     second_images: Annotated[
         Path | None,
-        _options.PLAIN.option("The photographs of B, where it does not tell.", "--images-b", metavar="FOLDER"),
+        _options.PLAIN.option("The photographs of B, if they are not found.", "--images-b", metavar="FOLDER"),
     ] = None,
     scale: Annotated[bool, _options.PLAIN.option("B may have another scale; without, both have the same.")] = True,
     force: _options.Force = False,

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """``groma selfcheck``: every derivative, and the covariances, checked on this machine."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -10,6 +13,9 @@ from groma._counted import counted
 from groma.cli.shared import options as _options
 from groma.cli.shared.console import Console
 from groma.errors import InputError
+
+if TYPE_CHECKING:
+    from groma.factors import SelfCheckRow
 
 #: Simulated scenes (cost: time).
 _RUNS = 100
@@ -31,11 +37,11 @@ def selfcheck(
         int, _options.PLAIN.option("Scenes simulated with --nees, for either gauge.", min=2, metavar="N")
     ] = _RUNS,
     seed: _options.Seed = 0,
-    force: _options.Force = False,
+    force: _options.ForceReport = False,
 ) -> None:
     """Compare the analytic derivatives of every factor with numeric ones, and with reference values.
 
-    Prints the worst deviation per factor and block. With --nees, simulates scenes of known noise and prints how the
+    Prints the worst deviation per factor, with --verbose per block. With --nees, simulates scenes of known noise and prints how the
     errors of poses, points, lines, planes, directions and intrinsics compare with their covariances. Exit code 1 if
     something is too large.
     """
@@ -60,13 +66,31 @@ def _check_derivatives(console: Console, golden: Path | None, seed: int) -> tupl
     from groma.factors import selfcheck as run_selfcheck
 
     outcome = run_selfcheck(golden, seed)
-    console.say(f"{'factor':<36}{'block':<34}{'against':<12}{'cases':>6}{'worst / allowed':>18}")
+    by_factor: dict[tuple[str, str], list[SelfCheckRow]] = {}
     for row in outcome.rows:
-        mark = "" if row.passed else "   FAILED"
-        console.say(f"{row.factor:<36}{row.block:<34}{row.against:<12}{row.cases:>6}{row.worst:>18.2e}{mark}")
-    failures = sum(not row.passed for row in outcome.rows)
-    console.say(f"{counted(len(outcome.rows), 'comparisons')}, {failures:,} failed.")
+        by_factor.setdefault((row.factor, row.against), []).append(row)
+    console.table(
+        ["factor or camera", "against", "comparisons", "worst / allowed", ""],
+        [
+            [factor, against, f"{len(rows):,}", f"{max(row.worst for row in rows):.1e}", _mark(rows)]
+            for (factor, against), rows in by_factor.items()
+        ],
+    )
+    failed = [row for row in outcome.rows if not row.passed]
+    if console.verbose or failed:
+        console.table(
+            [f"{'each' if console.verbose else 'failed'}: factor or camera", "by", "against", "worst / allowed", ""],
+            [
+                [row.factor, row.block, row.against, f"{row.worst:.1e}", _mark([row])]
+                for row in (outcome.rows if console.verbose else failed)
+            ],
+        )
+    console.say(f"{counted(len(outcome.rows), 'comparisons')}, {len(failed):,} failed.")
     return outcome.passed, outcome.to_dict()
+
+
+def _mark(rows: Sequence[SelfCheckRow]) -> str:
+    return "" if all(row.passed for row in rows) else "FAILED"
 
 
 def _check_covariances(console: Console, runs: int, seed: int) -> tuple[bool, dict[str, Any]]:
@@ -75,11 +99,16 @@ def _check_covariances(console: Console, runs: int, seed: int) -> tuple[bool, di
 
     outcome = ConsistencyReport(runs, seed, consistency(runs, seed).rows + localization_consistency(runs, seed))
     console.say("Normalised estimation error squared: its average should be the degrees of freedom.")
-    console.say(f"{'gauge':<8}{'kind':<12}{'expected':>9}{'average':>9}{'95 % band':>19}{'errors':>9}")
-    for row in outcome.rows:
-        mark = "" if row.inside else "   outside" if row.passed else "   FAILED"
-        band = f"{row.low:.3f} .. {row.high:.3f}"
-        console.say(f"{row.gauge:<8}{row.kind:<12}{row.dof:>9}{row.average:>9.3f}{band:>19}{row.count:>9}{mark}")
+    console.table(
+        ["kind", "gauge", "expected", "average", "95 % band", "errors", ""],
+        [
+            [
+                *(row.kind, row.gauge, f"{row.dof}", f"{row.average:.3f}", f"{row.low:.3f} .. {row.high:.3f}"),
+                *(f"{row.count:,}", "" if row.inside else "outside" if row.passed else "FAILED"),
+            ]
+            for row in outcome.rows
+        ],
+    )
     inside = sum(row.inside for row in outcome.rows)
     failures = sum(not row.passed for row in outcome.rows)
     console.say(

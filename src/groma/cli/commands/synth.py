@@ -15,7 +15,7 @@ Kind = Literal["holistic", "corridor"]
 def synth(
     console: Console,
     output: Annotated[
-        Path, _options.PLAIN.option("Folder for truth.npz and start.npz (made anew).", "--output", "-o", metavar="OUT")
+        Path, _options.PLAIN.option("Folder for truth.npz and start.npz.", "--output", "-o", metavar="OUT")
     ],
     kind: Annotated[
         Kind,

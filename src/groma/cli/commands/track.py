@@ -46,7 +46,7 @@ def track(
         ),
     ] = None,
     camera_params: Annotated[
-        str | None, _options.CAMERAS.option("The parameters, pixels counted as COLMAP does.", metavar="F,CX,CY,...")
+        str | None, _options.CAMERAS.option("The parameters, in COLMAP's order and pixel coordinates.", metavar="F,CX,CY,...")
     ] = None,
     kind: Annotated[
         str | None,

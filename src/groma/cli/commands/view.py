@@ -27,7 +27,7 @@ def view(
         bool, _options.PLAIN.option("Follow groma track while it runs: INPUT is its OUT.", "--live")
     ] = False,
     browser: Annotated[bool, _options.PLAIN.option("Open a browser.")] = True,
-    force: _options.Force = False,
+    force: _options.ForceReport = False,
 ) -> None:
     """Look at a scene in the browser: cameras, points, lines, planes. Click a line for its observations.
 

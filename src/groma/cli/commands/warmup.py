@@ -17,12 +17,12 @@ def warmup(
         list[str] | None,
         typer.Argument(
             autocompletion=_complete.one_of(*_complete.COMPILED),
-            metavar="[adjust|map|track]...",
-            help="What to compile for; everything if left out.",
+            metavar="PART",
+            help="What to compile for: adjust, map, track; everything if left out.",
         ),
     ] = None,
     again: Annotated[bool, _options.PLAIN.option("Run even if everything is there.", "--again")] = False,
-    force: _options.Force = False,
+    force: _options.ForceReport = False,
 ) -> None:
     """Compile and keep what groma adjust, groma map and groma track need on this machine.
 

@@ -7,6 +7,7 @@ import functools
 import inspect
 import os
 import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ import typer
 from typer.core import TyperCommand
 
 from groma.cli.shared.console import Console
+from groma.cli.shared.style import is_terminal, terminal_width, wrapped
 from groma.errors import did_you_mean
 
 
@@ -52,13 +54,28 @@ NoColor = Annotated[bool, GENERAL.option("Use no colours; so does the environmen
 class Command(TyperCommand):
     """A command whose help has headings, and that suggests what may have been meant by a value that is no choice."""
 
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """Return what follows the name of the command in its usage: what must be given, and ``[what may be]``."""
+        pieces = ["[OPTIONS]"]
+        for one in self.get_params(ctx):
+            if one.param_type_name == "argument":
+                name = (one.metavar or one.name) + ("..." if one.nargs != 1 else "")
+                pieces.append(name if one.required else f"[{name}]")
+            elif one.required:
+                pieces.append(f"{min(one.opts, key=len)} {one.metavar}")
+        return pieces
+
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the options under their headings, in the order in which these first appear."""
         sections: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
         for parameter in self.get_params(ctx):
             record = parameter.get_help_record(ctx)
             if record is not None:
-                sections.setdefault(_heading(parameter), []).append(record)
+                name, text = record
+                if parameter.param_type_name == "argument":
+                    name = parameter.metavar or parameter.name  # the kind of value is said by the help
+                name = re.sub(r"[<\[]([\w|]+)[>\]]$", r"\1", name)  # choices: one|another
+                sections.setdefault(_heading(parameter), []).append((name, text))
         for heading, records in sections.items():
             if records:
                 with formatter.section(heading):
@@ -73,12 +90,34 @@ class Command(TyperCommand):
                 raise typer.BadParameter(f"a value{where} is empty. Is a variable of the shell not set?", ctx=ctx)
         try:
             return super().parse_args(ctx, args)
-        except typer.BadParameter as error:
-            value, *choices = re.findall(r"'([^']*)'", error.message) or [""]
-            error.message = error.message.removeprefix("Value error, ")
-            if "is not one of" in error.message:
-                error.message += did_you_mean(value, choices)
+        except Exception as error:  # of wrong usage: its class is Click's or Typer's own, by Typer's version
+            if isinstance(error, typer.BadParameter):
+                error.message = _in_plain_words(error.message)
+            if hasattr(error, "format_message") and is_terminal(sys.stderr):
+                words = wrapped(f"Error: {error.format_message()}", terminal_width()).removeprefix("Error: ")
+                error.format_message = lambda: words
             raise
+
+
+#: What Typer says of a value that it cannot take, and what groma says.
+_PLAIN = (
+    (r"Value error, ", ""),
+    (r"Input should be a valid integer.*", "must be a whole number."),
+    (r"Input should be a valid number.*", "must be a number."),
+    (r"Input should be greater than or equal to (\S+)", r"must be \1 or more."),
+    (r"Input should be less than or equal to (\S+)", r"must be \1 or less."),
+)
+
+
+def _in_plain_words(message: str) -> str:
+    """Return what is wrong with a value, and which choice may have been meant."""
+    for words, plain in _PLAIN:
+        message = re.sub(f"^{words}", plain, message)
+    named, among, choices = message.partition("is not one of")
+    if among:
+        (value, *_), choices = re.findall(r"'([^']*)'", named) or [""], re.findall(r"[\w-]+", choices)
+        message += did_you_mean(value, choices)
+    return message
 
 
 def _heading(parameter: Any) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from groma._counted import counted
 from groma.cli.shared.progress import Plan, Progress, Stages
-from groma.cli.shared.style import Style, aligned, is_terminal, paint, terminal_width, wrapped
+from groma.cli.shared.style import Style, aligned, can_rewrite, is_terminal, paint, terminal_width, wrapped
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -72,7 +72,10 @@ class Console:
         """Say that something was written, and where."""
         if not self.quiet:
             for place in places:
-                print(f"{paint('Wrote', 'green', self._stream)} {place}", file=self._stream, flush=True)
+                line = f"Wrote {place}"
+                if not isinstance(place, Path) and is_terminal(self._stream):  # a path alone is copied
+                    line = wrapped(line, terminal_width())
+                print(line.replace("Wrote", paint("Wrote", "green", self._stream), 1), file=self._stream, flush=True)
 
     def wrote_page(self, folder: Path) -> None:
         """Say that a folder was written, and where the page in it is."""
@@ -90,7 +93,7 @@ class Console:
         ahead.expect(work, self._announce_compilation, self.threads)
 
     def _announce_compilation(self) -> None:
-        if not self.quiet and is_terminal(sys.stderr):
+        if not self.quiet and can_rewrite(sys.stderr):
             sys.stderr.write("\r\x1b[K")  # the line of progress
         self.say("First run: compiling for this machine. Later runs start at once.")
 

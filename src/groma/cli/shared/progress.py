@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What goes on, on standard error: one line that rewrites itself on a terminal, one now and then in a pipe."""
+"""What goes on, on standard error: one line that rewrites itself on a terminal, one now and then elsewhere."""
 
 import sys
 import time
@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Any, Self
 
-from groma.cli.shared.style import has_colours, is_terminal, paint, terminal_width
+from groma.cli.shared.style import can_rewrite, has_colours, paint, terminal_width
 
 #: Seconds between two lines where progress cannot rewrite itself, and characters of a full bar and of a short one.
 PAUSE, BAR, SHORT_BAR = 10.0, 20, 6
@@ -17,15 +17,15 @@ _ERASE = "\r\x1b[K"
 
 
 class Line:
-    """One line on a terminal, which vanishes at the end; in a pipe or a file, a line every ten seconds."""
+    """One line on a terminal, which vanishes at the end; in a pipe, a file or where TERM is dumb, one every ten seconds."""
 
     def __init__(self, quiet: bool) -> None:
-        self._is_terminal = not quiet and is_terminal(sys.stderr)
+        self._rewrites = not quiet and can_rewrite(sys.stderr)
         self._is_heard = not quiet
         self._last = time.monotonic()
 
     def _show(self, head: str, parts: str = "", share: float | None = None) -> None:
-        if self._is_terminal:
+        if self._rewrites:
             sys.stderr.write(f"{_ERASE}{screen_line(head, parts, share, terminal_width())}")
             sys.stderr.flush()
         elif self._is_heard and time.monotonic() - self._last >= PAUSE:
@@ -41,7 +41,7 @@ class Line:
         self._wipe()
 
     def _wipe(self) -> None:
-        if self._is_terminal:
+        if self._rewrites:
             sys.stderr.write(_ERASE)
             sys.stderr.flush()
 
@@ -150,7 +150,8 @@ def screen_line(head: str, parts: str, share: float | None, width: int) -> str:
     room = width - 1
     bar = min(BAR, room - len(f"  {head}  []  {parts}")) if share is not None else 0
     if bar < SHORT_BAR or share is None:
-        return f"  {head}  {parts}".rstrip()[:room]
+        line = f"  {head}  {parts}".rstrip()
+        return line if len(line) <= room else f"  {head}  {parts.partition(',')[0]}".rstrip()[:room]
     filled = int(bar * min(max(share, 0.0), 1.0))
     full, empty = ("━", "━") if has_colours(sys.stderr) and _can_say("━") else ("#", ".")
     drawn = paint(full * filled, "green", sys.stderr) + paint(empty * (bar - filled), "dim", sys.stderr)

@@ -19,9 +19,14 @@ def is_terminal(stream: TextIO | None) -> bool:
     return stream is not None and stream.isatty()
 
 
+def can_rewrite(stream: TextIO | None) -> bool:
+    """Tell whether a line of a stream can be written anew: a terminal, unless TERM is dumb."""
+    return is_terminal(stream) and os.environ.get("TERM") != "dumb"
+
+
 def has_colours(stream: TextIO | None) -> bool:
     """Tell whether a stream shows colours: a terminal, unless NO_COLOR is set or TERM is dumb."""
-    return is_terminal(stream) and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+    return can_rewrite(stream) and not os.environ.get("NO_COLOR")
 
 
 def paint(text: str, style: Style, stream: TextIO | None) -> str:
