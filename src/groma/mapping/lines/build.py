@@ -21,13 +21,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from groma._typing import IntArray
 from groma.errors import InputError
 from groma.execution import begin, work_with
+from groma.features.matching.wide_baseline import LineMatches
+from groma.features.segments import Segments
 from groma.mapping.lines.by_clusters import map_lines_by_clusters
 from groma.mapping.lines.collect import line_map_of
 from groma.mapping.lines.filtering.filters import Evidence, filtered
@@ -45,10 +46,6 @@ from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.outcomes import Outcome
 from groma.mapping.lines.views import build_views
 from groma.scene import Scene
-
-if TYPE_CHECKING:
-    from groma.features.matching.wide_baseline import LineMatches
-    from groma.features.segments import Segments
 
 
 def map_lines(

@@ -21,12 +21,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, TypeVar, overload
+from typing import TypeVar, overload
 
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_work
+from groma.features.segments import Segments
 from groma.mapping.lines.clusters import Cluster, clusters, rows_of_images
 from groma.mapping.lines.collect import line_map_of
 from groma.mapping.lines.filtering.filters import NEARBY, Evidence, SegmentKinds, filtered, is_edge
@@ -43,9 +44,6 @@ from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.outcomes import Outcome
 from groma.mapping.lines.views import build_views, views_of_rows
 from groma.scene import Scene
-
-if TYPE_CHECKING:
-    from groma.features.segments import Segments
 
 _Item = TypeVar("_Item")
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,13 +18,11 @@ from groma import cameras as camera_models
 from groma._trees import kd_tree
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_in_threads, map_work
+from groma.features.segments import Segments
 from groma.gates import gate
 from groma.geometry import quaternion, segment2
 from groma.mapping.groups import grouped
 from groma.scene import Scene
-
-if TYPE_CHECKING:
-    from groma.features.segments import Segments
 
 
 @dataclass(frozen=True)

@@ -16,21 +16,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from groma import cameras as camera_models
 from groma._typing import FloatArray
 from groma.execution import map_work
+from groma.features.segments import Segments
 from groma.features.vanishing_points import find_vanishing_points
 from groma.gates import gate
 from groma.geometry import quaternion
 from groma.mapping.lines.views import LineViews
 from groma.scene import Scene
-
-if TYPE_CHECKING:
-    from groma.features.segments import Segments
 
 
 @dataclass(frozen=True)

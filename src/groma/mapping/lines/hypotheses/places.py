@@ -11,13 +11,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
 from groma.execution import map_largest_first, map_work, num_calls
+from groma.features.matching.wide_baseline import LineMatches
 from groma.mapping.groups import grouped
 from groma.mapping.lines.clusters import Cluster, clusters
 from groma.mapping.lines.hypotheses.consensus import choose
@@ -28,9 +28,6 @@ from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.outcomes import Outcome
 from groma.mapping.lines.views import LineViews
 from groma.scene import Scene
-
-if TYPE_CHECKING:
-    from groma.features.matching.wide_baseline import LineMatches
 
 
 @dataclass(frozen=True, eq=False)
