@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,14 +15,16 @@ from groma._typing import FloatArray, IntArray
 from groma.execution import map_work
 from groma.features.depth.lines import DepthLineGates, fit_depth_lines
 from groma.features.depth.noise import DepthNoise
-from groma.features.segments import Segments
 from groma.geometry import quaternion
 from groma.io.depth_maps import DepthMaps
 from groma.mapping.depth.points import MeasuredDepths, image_sizes, read_map
 from groma.mapping.depth.unit import ROBUST
-from groma.mapping.lines.line_map import LineMap
 from groma.scene import LineDepths, Scene
 from groma.scene.line_intervals import shares_on_lines
+
+if TYPE_CHECKING:
+    from groma.features.segments import Segments
+    from groma.mapping.lines.line_map import LineMap
 
 
 def segment_depths(
