@@ -9,7 +9,7 @@ counts another checkout, ``--list`` prints what a row counts, ``--rooms`` the so
 ==========================  ==========================================================================================
 Row                         Rule
 ==========================  ==========================================================================================
-lines, source lines         all lines of ``src/groma/**``, stubs too; those that are neither blank, comment nor docstring
+lines, source lines         all lines of ``src/groma``, stubs too; those that are neither blank, comment nor docstring
 largest room, longest ...   files of a room; lines of a module, and of a function (commands: of its body)
 repeated lines              source lines, imports and lone brackets left out, in runs of six or more that stand in the
                             sources twice to the letter

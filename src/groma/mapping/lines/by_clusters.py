@@ -185,10 +185,8 @@ def _places_of(asked: tuple[_Part, EarlierMap | None]) -> tuple[Places, FloatArr
     known = None if earlier is None else earlier.known(part.scene, views, near, options.noise)
     if earlier is not None and earlier.same_cameras(part.scene):
         ratios = earlier.lines.depth_ratios
-    elif options.use_directions:
-        ratios = depth_ratios(part.scene, part.segments, views)
     else:
-        ratios = np.zeros((len(views.image_idx), 2))
+        ratios = depth_ratios(part.scene, part.segments, views)
     found = find_places(part.scene, views, ratios, near, None, options, lambda done, total: None, known)
     own = np.flatnonzero(part.is_own[views.image_idx])
     mine = found.take(own)
