@@ -37,8 +37,8 @@ class Part:
         """(M, k) places of the landmarks in the world, in the order of the matches."""
         return self.held[self.slots.index(self.kind[:-1])]
 
-    def of_rows(self, values: Mapping[str, FloatArray] | Mapping[str, BoolArray]):
-        """What belongs to the matches of this kind, in the order of the factors."""
+    def of_rows(self, values: Mapping[str, BoolArray]) -> BoolArray:
+        """What is said of the matches of this kind, in the order of the factors."""
         return values[self.kind][self.row]
 
 
