@@ -47,16 +47,17 @@ from groma.mapping.checkpoints import Stages, digest, digest_files, stage
 from groma.mapping.depth.segments import with_line_depths
 from groma.mapping.exchange import NeighborChooser, matches_for, neighbors_for, with_parts
 from groma.mapping.image_segments import detect_segments, given_segments
-from groma.mapping.lines.build import LineMap, MapLinesOptions, MatchProvider
 from groma.mapping.lines.confidence import DEFAULT_CONFIDENCE
 from groma.mapping.lines.hypotheses.earlier import EarlierMap
 from groma.mapping.lines.in_views import map_lines_in_views
-from groma.mapping.lines.options import MIN_LENGTH
+from groma.mapping.lines.line_map import LineMap
+from groma.mapping.lines.matches import MatchProvider
+from groma.mapping.lines.options import MIN_LENGTH, MapLinesOptions
 from groma.mapping.noise.observations import line_bend, line_end_correlation, moved_px, noise_px, with_point_noise
 from groma.mapping.noise.shared import with_shared_noise
 from groma.mapping.photographs import check_images, check_number, image_files, image_reader, images_left_out
 from groma.mapping.read_rows import adjust_read_rows, mapped_as_measured, read_by_rows, taken_at_once
-from groma.mapping.refine_points import PointRefinementOptions, refine_points
+from groma.mapping.refine_points import refine_points
 from groma.mapping.result import SCENES_OF_RESULT, MapResult, result_of
 from groma.mapping.start import start_of
 from groma.mapping.structure.find import StructureOptions, find_structure
@@ -313,7 +314,6 @@ def measure_points(folder: Path, points: Scene, options: MapOptions, say: StageP
         points,
         image_reader(folder, points.images.names),
         noise_px(points, "points"),
-        PointRefinementOptions(threads=options.threads),
         partial(say, "measuring points"),
     )
     weighted = dataclasses.replace(_robust(options), point_sigma_px=found.sigma_px)
