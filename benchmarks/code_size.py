@@ -9,7 +9,7 @@ counts another checkout, ``--list`` prints what a row counts, ``--rooms`` the so
 ==========================  ==========================================================================================
 Row                         Rule
 ==========================  ==========================================================================================
-lines, source lines         all lines of ``src/groma/**/*.py``; those that are neither blank, comment nor docstring
+lines, source lines         all lines of ``src/groma``, stubs too; those that are neither blank, comment nor docstring
 largest room, longest ...   files of a room; lines of a module, and of a function (commands: of its body)
 repeated lines              source lines, imports and lone brackets left out, in runs of six or more that stand in the
                             sources twice to the letter
@@ -62,9 +62,12 @@ class Module:
 def modules_of(root: Path) -> list[Module]:
     """Read the sources of a checkout."""
     found = []
-    for path in sorted((root / "src" / "groma").rglob("*.py")):
+    for path in sorted((root / "src" / "groma").rglob("*.py*")):
+        if path.suffix not in (".py", ".pyi"):
+            continue
         text = path.read_text(encoding="utf-8")
-        parts = path.relative_to(root / "src").with_suffix("").parts
+        path_in_src = path.relative_to(root / "src")
+        parts = (path_in_src.with_suffix("") if path.suffix == ".py" else path_in_src).parts
         is_package = parts[-1] == "__init__"
         found.append(Module(".".join(parts[: len(parts) - is_package]), is_package, text, ast.parse(text)))
     return found
@@ -220,11 +223,16 @@ def optimiser_loops(modules: list[Module]) -> Found:
 
 def top_level_names(modules: list[Module]) -> Found:
     """Names in ``groma.__all__``."""
-    root = next(module for module in modules if module.name == "groma")
-    for node in root.tree.body:
-        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__":
+    trees = {module.name: module.tree.body for module in modules}
+    found = []
+    for node in trees.get("groma.__init__.pyi", trees["groma"]):
+        if isinstance(node, ast.ImportFrom):
+            found += [alias.asname for alias in node.names if alias.asname and not alias.asname.startswith("_")]
+        elif isinstance(node, ast.Assign) and isinstance(node.value, ast.Name):
+            found.append(ast.unparse(node.targets[0]))
+        elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
             return list(ast.literal_eval(node.value))
-    return []
+    return found
 
 
 def public_names(modules: list[Module]) -> Found:

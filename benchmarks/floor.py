@@ -33,7 +33,8 @@ os.environ.setdefault("NUMBA_CACHE_DIR", str(CACHE / "numba"))
 
 import numpy as np  # noqa: E402
 
-from groma.adjustment.assemble import AssemblyOptions, assemble  # noqa: E402
+from groma.adjustment.assemble import assemble  # noqa: E402
+from groma.adjustment.assembly_options import AssemblyOptions  # noqa: E402
 from groma.io import read_scene  # noqa: E402
 from groma.problem.lay_out import lay_out  # noqa: E402
 from groma.problem.layout import Layout  # noqa: E402

@@ -69,7 +69,7 @@ def fed(sequence, frames: list, rate: float, waits: bool) -> str:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequence", type=Path)
     parser.add_argument("--rate", type=float, default=30.0, help="frames a second")
     parser.add_argument("--rounds", type=int, default=2)

@@ -28,9 +28,11 @@ from groma.features import Segments
 from groma.features.matches import LineMatches
 from groma.geometry import quaternion, segment2
 from groma.mapping.checkpoints import Stages
-from groma.mapping.lines.build import MapLinesOptions, map_lines, segment_matches
+from groma.mapping.lines.build import map_lines
 from groma.mapping.lines.confidence import DEFAULT_CONFIDENCE
+from groma.mapping.lines.matches import segment_matches
 from groma.mapping.lines.neighbors import covisible_neighbors
+from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.map import MapOptions, adjust_points, map_segments
 from groma.scene import Scene
 from groma.scene.line_intervals import one_line_per_interval

@@ -11,6 +11,9 @@ if it is ``localized`` where the picture was not taken: *pictures* are mirrored,
 twelve blocks in another order (four orders each), noise, blank, or of other places. One put together of blocks may have
 one where it was; with the pose of the photograph that it was made of it is ``localized``, and not ``wrong``. *Walls*
 and *facade* compare with the true pose.
+
+OTHER are folders of other places. Whatever of them is ``localized`` counts as wrong, so do not pass a folder that shows
+a piece of the mapped place, too: castle-P30, entry-P10 and fountain-P11 are one courtyard.
 """
 
 from __future__ import annotations

@@ -227,7 +227,8 @@ def make_corridor(folder: Path, observations: float, part: int) -> int:
 
 def compare_states(images: int, ranks: list[int], work: Path) -> None:
     """Print the largest differences between the states of a solve at once and of parts."""
-    from groma.adjustment.assemble import AssemblyOptions, assemble, disassemble
+    from groma.adjustment.assemble import assemble, disassemble
+    from groma.adjustment.assembly_options import AssemblyOptions
     from groma.adjustment.parts import join_parts, parts_of, write_parts
     from groma.adjustment.uncertainty import position_sigma, uncertainty
     from groma.geometry import line3
@@ -280,7 +281,7 @@ def states_options(method: str = "levenberg_marquardt"):
 
 def run_states(folder: Path, output: Path) -> None:
     """Solve parts together with the other processes, with damping and then without, and write them."""
-    from groma.adjustment.assemble import AssemblyOptions
+    from groma.adjustment.assembly_options import AssemblyOptions
     from groma.adjustment.parts import parts_of
     from groma.adjustment.parts.checkpoint import Checkpoint
     from groma.adjustment.parts.opened import open_parts

@@ -61,7 +61,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 import groma
-from groma.adjustment.assemble import AssemblyOptions, assemble, disassemble
+from groma.adjustment.assemble import assemble, disassemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.misfit.jackknife import landmark_jackknife, observations_alone
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.adjustment.uncertainty import position_sigma, uncertainty

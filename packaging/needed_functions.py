@@ -15,13 +15,15 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from groma._kernels import cache as kernel_cache
 from groma.cli.main import run
 from groma.compilation import loading
-from groma.compilation.needed import PLACE, Entry, function, read_type
+from groma.compilation.needed import PLACE, Entry, function, points_of, read_type
+from groma.compilation.runs import ESTIMATED, HELD
 
 
 def _adjust(folder: Path) -> None:
@@ -30,6 +32,18 @@ def _adjust(folder: Path) -> None:
 
     write_scene(synthetic.holistic(8, seed=1).start, folder / "start.npz")
     run(["adjust", str(folder / "start.npz"), "-o", str(folder / "out"), "--quiet"])
+
+
+def _adjust_points(folder: Path, model: str, is_estimated: bool) -> None:
+    from groma.compilation import runs
+    from groma.io import write_scene
+    from groma.scene import synthetic
+
+    start = synthetic.holistic(40, seed=1).start.points_only()
+    place = runs.with_own_cameras if model == "BAL" else runs.with_model
+    write_scene(place(start, model), folder / "start.npz")
+    calibration = "--refine-intrinsics" if is_estimated else "--fix-intrinsics"
+    run(["adjust", str(folder / "start.npz"), "-o", str(folder / "out"), calibration, "--quiet"])
 
 
 def _map(folder: Path) -> None:
@@ -85,6 +99,11 @@ WORK: dict[str, Callable[[Path], None]] = {
     "selfcheck": _selfcheck,
     "localize": _localize,
     "pose graph": _pose_graph,
+}
+WORK |= {
+    points_of(model, is_estimated): partial(_adjust_points, model=model, is_estimated=is_estimated)
+    for models, is_estimated in ((HELD, False), ((*ESTIMATED, "BAL"), True))
+    for model in models
 }
 
 

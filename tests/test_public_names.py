@@ -32,10 +32,10 @@ def test_name_can_be_loaded(name):
 
 
 def test_type_checkers_see_the_same_names():
-    tree = ast.parse(Path(inspect.getfile(groma)).read_text(encoding="utf-8"))
-    block = next(node for node in tree.body if isinstance(node, ast.If))
-    imported = {alias.asname or alias.name for node in block.body for alias in node.names}
-    assert imported == set(groma.__all__)
+    tree = ast.parse(Path(inspect.getfile(groma)).with_suffix(".pyi").read_text(encoding="utf-8"))
+    seen = {alias.asname for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names}
+    seen |= {node.targets[0].id for node in tree.body if isinstance(node, ast.Assign)}
+    assert seen - {None, "__version__"} == set(groma.__all__)
 
 
 def test_unknown_name_is_an_attribute_error_that_helps():

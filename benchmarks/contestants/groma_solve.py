@@ -14,7 +14,8 @@ import argparse
 from _common import MAX_STEPS, TOLERANCE, Curve, report
 
 import groma
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.io import read_scene
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve

@@ -8,7 +8,8 @@ import time
 import numpy as np
 from _common import report
 
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.scene import synthetic
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve

@@ -15,7 +15,8 @@ from types import SimpleNamespace
 from _common import Clock, peak_memory_mib, report
 
 import groma.solver.joint as joint
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.io import read_scene
 from groma.scene import Scene, synthetic
 from groma.solver import report as solver_report

@@ -7,7 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.consistency import consistency
 from groma.adjustment.consistency_scenes import STRUCTURE_SIGMA_PX, drawn
 from groma.errors import InputError

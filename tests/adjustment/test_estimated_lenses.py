@@ -4,7 +4,8 @@
 import numpy as np
 import pytest
 
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.consistency_scenes import drawn
 from groma.cameras import model
 from groma.solver.covariance.marginals import Covariances

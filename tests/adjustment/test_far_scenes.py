@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from groma.adjustment.adjust import AdjustOptions, adjust
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.diagnosis import diagnose_scene
 from groma.adjustment.uncertainty import uncertainty
 from groma.factors import PoseBetween

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 import groma
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.consistency_scenes import drawn
 from groma.adjustment.misfit.jackknife import landmark_jackknife, observations_alone
 from groma.adjustment.uncertainty import pose_uncertainty

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import groma
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.rescue.clusters import settle_clusters
 from groma.problem.residuals import squared_norms
 from groma.scene import Distances, Relations, synthetic

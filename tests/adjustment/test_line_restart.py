@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 import groma
-from groma.adjustment.assemble import LINE_FACTORS, AssemblyOptions, assemble
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.rescue.restart import _line_costs, renew_lines, with_seen_ends
+from groma.adjustment.terms.lines import LINE_FACTORS
 from groma.scene import Relations, synthetic
 
 pytestmark = pytest.mark.kernels

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 import groma
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.rescue.restart import with_seen_ends
 from groma.adjustment.rescue.slips import without_slips
 from groma.factors.losses import Cauchy

@@ -7,7 +7,8 @@ import pytest
 from _mpi import mpiexec, needs_mpi, same_bytes
 
 import groma
-from groma.adjustment.assemble import AssemblyOptions, assemble, disassemble, first_camera_gauge
+from groma.adjustment.assemble import assemble, disassemble, first_camera_gauge
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.parts import adjust_parts, join_parts, num_ties_cut, write_parts
 from groma.cli.main import run
 from groma.errors import InputError

@@ -8,6 +8,7 @@ from groma.adjustment.graphs.pose_graph import PoseGraphOptions, adjust_pose_gra
 from groma.errors import InputError
 from groma.geometry import quaternion, se3
 from groma.scene.pose_graph import GraphPoses, Motions, PoseGraph
+from groma.solver import levenberg_marquardt
 
 pytestmark = pytest.mark.kernels
 
@@ -155,6 +156,25 @@ def test_a_start_from_the_motions_alone(rng):
 
 
 @pytest.mark.compiled
+def test_damping_does_not_hold_back_a_long_chain(monkeypatch):
+    # the ends of 3000 poses in a row move far for little: with the damping of free scenes, small steps remain
+    rng, count = np.random.default_rng(5), 3000
+    truth = np.zeros((count, 7))
+    truth[:, 3], truth[:, 4] = 1.0, np.arange(count)
+    first, second = np.hstack([[np.arange(count - 1), np.arange(1, count)], rng.integers(0, count, (3, 2)).T])
+    sigma = np.array([0.01, 0.01, 0.0, 0.0, 0.0, 0.001])
+    error = rng.normal(size=(len(first), 6)) * sigma
+    motion = se3.compose(se3.compose(se3.inverse(truth[first]), truth[second]), se3.exp(error))
+    information = np.tile(np.diag(np.where(sigma > 0, sigma, 1.0) ** -2.0), (len(first), 1, 1))
+    graph = PoseGraph(GraphPoses(np.arange(count), truth), Motions(first, second, motion, information), planar=True)
+    now = adjust_pose_graph(graph).report
+    monkeypatch.setattr(levenberg_marquardt, "ROUNDING_DAMPING", levenberg_marquardt.MIN_DAMPING)
+    before = adjust_pose_graph(graph).report
+    assert now.converged
+    assert now.iterations < before.iterations
+    assert now.final_cost <= before.final_cost
+
+
 def test_a_wrong_motion_loses(rng):
     _, graph = ring(rng, count=30, noise=0.01)
     motions = graph.motions

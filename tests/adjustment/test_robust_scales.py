@@ -8,7 +8,8 @@ import pytest
 
 import groma
 from groma.adjustment.adjust import _wide_enough
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.stages import STAGES, with_loss
 from groma.errors import InputError
 from groma.evaluation import evaluate_poses

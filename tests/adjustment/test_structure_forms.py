@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 import groma
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.terms.relations_in_pixels import _join
 from groma.problem.lay_out import lay_out
 from groma.scene import Relations, synthetic

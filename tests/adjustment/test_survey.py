@@ -14,7 +14,8 @@ from _survey import (
 
 import groma
 from groma.adjustment.adjust import AdjustOptions, adjust
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.parts import adjust_parts, join_parts, write_parts
 from groma.adjustment.survey.given_poses import given_poses_of
 from groma.adjustment.survey.protocol import protocol

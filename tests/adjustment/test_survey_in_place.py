@@ -16,7 +16,8 @@ from _survey import (
 )
 
 from groma.adjustment.adjust import AdjustOptions, adjust
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.places import at_places_of
 from groma.adjustment.survey.align import align
 from groma.adjustment.survey.attach import Survey, with_survey

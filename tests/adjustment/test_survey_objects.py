@@ -11,7 +11,8 @@ import pytest
 from _survey import ELSEWHERE, SIGMA, control, control_file, made, measured_positions, on_rigs, positions
 
 from groma.adjustment.adjust import AdjustOptions, adjust
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.diagnosis import diagnose_scene
 from groma.adjustment.survey.attach import with_survey
 from groma.adjustment.survey.given import Survey

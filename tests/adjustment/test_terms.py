@@ -10,8 +10,8 @@ from _measured import with_measurements
 from _survey import Exact, with_everything, with_objects
 
 import groma
-from groma.adjustment.assemble import TERMS, AssemblyOptions, assemble
-from groma.adjustment.assembly_options import RightTurnPrior
+from groma.adjustment.assemble import TERMS, assemble
+from groma.adjustment.assembly_options import AssemblyOptions, RightTurnPrior
 from groma.adjustment.parts import adjust_parts, write_parts
 from groma.adjustment.terms.contract import Group, Term
 from groma.errors import InputError

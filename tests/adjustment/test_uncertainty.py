@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from groma.adjustment.adjust import AdjustOptions, adjust
-from groma.adjustment.assemble import AssemblyOptions
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.diagnosis import diagnose_scene
 from groma.adjustment.uncertainty import position_sigma, uncertainty
 from groma.errors import InputError

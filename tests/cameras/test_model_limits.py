@@ -224,10 +224,10 @@ def test_undistortion_leaves_out_what_lies_behind():
     assert np.isfinite(undistorted[1]).all()
 
 
-def test_bearing_noise_of_a_pinhole_in_closed_form():
+def test_bearings_of_a_pinhole_in_closed_form():
     """On the axis a pixel is 1/f radians in every direction."""
-    _, covariance = cameras.SIMPLE_PINHOLE.bearing_covariance([500, 320, 240], np.array([[320.0, 240.0]]), 2.0)
-    np.testing.assert_allclose(covariance[0], np.diag([1.0, 1.0, 0.0]) * (2 / 500) ** 2, rtol=1e-14, atol=1e-22)
+    _, G = cameras.SIMPLE_PINHOLE.bearing_jacobian(np.array([500.0, 320.0, 240.0]), np.array([[320.0, 240.0]]))
+    np.testing.assert_allclose(G[0] @ G[0].T, np.diag([1.0, 1.0, 0.0]) / 500**2, rtol=1e-14, atol=1e-22)
 
 
 def test_denominator_of_zero_has_no_image():

@@ -191,14 +191,6 @@ def test_bearing_noise(name):
         numeric = (model.unproject(params, pixels + moved) - model.unproject(params, pixels - moved)) / (2 * step)
         np.testing.assert_allclose(G[:, :, j], numeric, rtol=0, atol=1e-10)
     np.testing.assert_allclose(np.einsum("ni,nij->nj", bearings, G), 0.0, rtol=0, atol=1e-16)
-    same, covariance = model.bearing_covariance(params, pixels, 0.5)
-    np.testing.assert_array_equal(same, bearings)
-    np.testing.assert_allclose(covariance, 0.25 * np.einsum("nij,nkj->nik", G, G), rtol=1e-12, atol=1e-22)
-    full = np.array([[0.04, 0.01], [0.01, 0.09]])
-    _, covariance = model.bearing_covariance(params, pixels, np.tile(full, (10, 1, 1)))
-    np.testing.assert_allclose(covariance, G @ full @ np.swapaxes(G, 1, 2), rtol=1e-12, atol=1e-22)
-    _, covariance = model.bearing_covariance(params, pixels, np.arange(10.0))
-    np.testing.assert_allclose(covariance[3], 9.0 * G[3] @ G[3].T, rtol=1e-12, atol=1e-22)
 
 
 def test_pinhole_parameters():
@@ -232,5 +224,3 @@ def test_messages():
         model.project(np.ones(4), np.ones((3, 5)))
     with pytest.raises(ShapeError, match=r"pixels must have shape \(N, 2\)"):
         model.unproject(np.ones(4), np.ones(2))
-    with pytest.raises(ShapeError, match=r"sigma must be"):
-        model.bearing_covariance(np.ones(4), np.ones((3, 2)), np.ones(2))

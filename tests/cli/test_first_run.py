@@ -25,7 +25,7 @@ pytestmark = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing 
 def test_what_is_listed_exists(work):
     """After a function was renamed, or its arguments changed: python packaging/needed_functions.py."""
     entries = needed.needed(work)
-    assert work in needed.IMPORTS
+    assert needed.imported(work) is not None
     assert len(entries) > 15
     for module, name, kinds in entries:
         compiled = needed.function(module, name)
@@ -43,6 +43,33 @@ def test_the_list_is_what_an_adjustment_calls():
     listed = {(module, name, tuple(map(repr, kinds))) for module, name, kinds in needed.needed("adjust")}
     assert len(called & listed) >= 0.9 * len(listed)
     assert len(called & listed) >= 0.9 * len([entry for entry in called if "_all" in entry[1]])
+
+
+@pytest.mark.parametrize("is_estimated", [False, True])
+def test_points_alone_have_a_list_of_their_own(is_estimated):
+    """It names what that camera model calls, and no more; what is mixed or not listed has the list of everything."""
+    work = needed.adjusting(("PINHOLE", "PINHOLE"), is_estimated, True)
+    assert work == needed.points_of("PINHOLE", is_estimated) and work in needed.works()
+    modules = {module.rpartition(".")[2] for module, *_ in needed.needed(work)}
+    assert "point_reprojection" in modules
+    assert not modules & {"line_reprojection", "line_cartesian", "plane_normal_offset", "point_on_plane"}
+    assert len(needed.needed(work)) < 0.8 * len(needed.needed("adjust"))
+    assert needed.adjusting(("PINHOLE",), is_estimated, False) == "adjust"
+    assert needed.adjusting(("PINHOLE", "OPENCV"), is_estimated, True) == "adjust"
+    assert needed.adjusting(("A_MODEL_OF_A_PLUGIN",), is_estimated, True) == "adjust"
+
+
+def test_the_command_expects_what_its_scene_needs(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(ahead, "expect", lambda work, *more: asked.append(work))
+    scene = synthetic.holistic(4, seed=2).start
+    for name, content in (("all", scene), ("points", scene.points_only())):
+        groma.write_scene(content, tmp_path / f"{name}.npz")
+        assert run(["adjust", str(tmp_path / f"{name}.npz"), "--max-iterations", "1", "--quiet"]) == 0
+    call = ["adjust", str(tmp_path / "points.npz"), "--max-iterations", "1", "--quiet", "--refine-intrinsics"]
+    assert run(call) == 0
+    model = scene.cameras.models[0]
+    assert asked == ["adjust", needed.points_of(model, False), needed.points_of(model, True)]
 
 
 def test_types_are_read_as_numba_writes_them():

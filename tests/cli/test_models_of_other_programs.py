@@ -72,6 +72,25 @@ def test_a_model_without_image_sizes_is_said(here, capsys):
     assert "2 cameras have no known size" in capsys.readouterr().err
 
 
+def test_points_that_no_image_sees_are_said(here, capsys):
+    """OpenSfM's observations are in a file of their own, which is not always there."""
+    lens = {"projection_type": "perspective", "width": 640, "height": 480, "focal": 0.9, "k1": 0.0, "k2": 0.0}
+    shot = {"camera": "one", "rotation": [0.0, 0.0, 0.0], "translation": [0.0, 0.0, 0.0]}
+    points = {"1": {"coordinates": [0.0, 0.0, 5.0]}, "2": {"coordinates": [1.0, 0.0, 5.0]}}
+    document = [{"cameras": {"one": lens}, "shots": {"a.jpg": shot}, "points": points}]
+    Path("reconstruction.json").write_text(json.dumps(document))
+    assert run(["convert", "reconstruction.json", "out.npz"]) == 0
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "which images see its 2 points" in said and "tracks.csv" in said
+    assert run(["convert", "reconstruction.json", "transforms.json"]) == 0  # no place for them
+    assert capsys.readouterr().err == ""
+    Path("tracks.csv").write_text("a.jpg\t1\t0\t0.0\t0.0\n")
+    assert run(["convert", "reconstruction.json", "seen.npz"]) == 0
+    assert capsys.readouterr().err == ""
+    assert run(["convert", "mvg", "all.npz"]) == 0
+    assert capsys.readouterr().err == ""
+
+
 def test_poses_alone_are_no_model_for_a_map(here, capsys):
     Path("images").mkdir()
     assert run(["map", "images", "--model", "nerf", "-o", "out"]) == 1

@@ -9,7 +9,7 @@ from groma import cameras as camera_models
 from groma.features.matches import LineMatches
 from groma.features.segments import Segments
 from groma.geometry import quaternion, se3
-from groma.mapping.lines.build import LineMap
+from groma.mapping.lines.line_map import LineMap
 from groma.scene import Cameras, PointObservations, Points, Scene
 
 WIDTH, HEIGHT = 800, 600

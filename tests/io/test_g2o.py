@@ -108,7 +108,7 @@ def test_poses_that_are_not_given_are_composed(tmp_path):
         ("VERTEX_SE2 1 2 3 4\nVERTEX_SE2 1 2 3 4\n", "same id"),
         ("VERTEX_SE2 0 0 0 0\nEDGE_SE2 0 5 1 2 0.5 4 1 0 4 0 16\n", "names pose 5"),
         (PLANE + "FIX 9\n", "FIX names pose 9"),
-        (PLANE + "EDGE_SE2 0 1 1 2 0.5 -4 0 0 4 0 16\n", "motion 1 is not positive semidefinite"),
+        (PLANE + "EDGE_SE2 0 1 1 2 0.5 -4 0 0 4 0 16\n", "1 of 2 motions is not .*, the first from 0 to 1;"),
         (PLANE + SPACE, "mixes"),
         ("VERTEX_SE3:QUAT 7 1 2 3 0 0 0 0\n", "quaternion of length 0"),
     ],

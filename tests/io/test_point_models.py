@@ -10,6 +10,7 @@ from groma.errors import InputError
 from groma.io import read_colmap, to_pycolmap, write_colmap
 from groma.io.colmap import mappers
 from groma.io.colmap import sfm as colmap_sfm
+from groma.io.colmap.load import load_pycolmap
 from groma.io.colmap.pairs import blocks_of_pairs, pair_blocks
 from groma.io.colmap.sfm import PointModelOptions, reconstruct_points
 from groma.scene.synthetic.scenes import holistic
@@ -80,5 +81,23 @@ def test_what_is_said_without_a_model_depends_on_what_is_missing(tmp_path, monke
     monkeypatch.setattr(mappers, "_incremental", lambda *arguments: [])
     with pytest.raises(InputError, match="show no texture"):
         reconstruct_points(tmp_path, tmp_path, ["a.png", "b.png", "c.png"])
-    assert "overlap too little" in colmap_sfm._why_none(5000, 200, 9)
-    assert "the camera only turned" in colmap_sfm._why_none(70_000, 70_000, 9)
+    assert "overlap too little" in colmap_sfm._why_none(5000, 200, 9, 2)
+    assert "the camera only turned" in colmap_sfm._why_none(70_000, 70_000, 9, 9)
+    assert "No 3 of them are linked" in colmap_sfm._why_none(44_258, 513, 4, 2)
+
+
+def test_images_are_linked_by_pairs_of_many_matches(tmp_path):
+    pycolmap = load_pycolmap()
+    with colmap_sfm._opened(pycolmap, tmp_path / "database.db") as content:
+        camera = content.write_camera(pycolmap.Camera(model="SIMPLE_PINHOLE", width=9, height=9, params=[9, 4, 4]))
+        one, two, three, four = (
+            content.write_image(pycolmap.Image(name=name, camera_id=camera)) for name in ("a", "b", "c", "d")
+        )
+        for pair, count in (((one, two), 348), ((three, four), 120), ((two, four), 56)):
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.inlier_matches = np.tile(np.arange(count, dtype=np.uint32)[:, None], 2)
+            content.write_two_view_geometry(*pair, geometry)
+        assert colmap_sfm._most_linked(pycolmap, content) == 2
+        geometry.inlier_matches = np.tile(np.arange(100, dtype=np.uint32)[:, None], 2)
+        content.write_two_view_geometry(one, three, geometry)
+        assert colmap_sfm._most_linked(pycolmap, content) == 4

@@ -6,6 +6,7 @@ import shutil
 from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -163,6 +164,7 @@ def test_maps_of_different_places_are_not_joined(place, maps, tmp_path):
     (tmp_path / "b").mkdir()
     for name in HALVES["b"]:
         image = cv2.imread(str(place / "b" / name))
+        assert image is not None
         cv2.imwrite(str(tmp_path / "b" / name), image[:, ::-1])
     other = Localizer(read_scene(place / "b.npz"), tmp_path / "b")
     with pytest.raises(InputError, match="cannot be joined"):
@@ -174,8 +176,9 @@ def test_segments_that_show_one_line_are_paired():
     query = np.array([[110, 100.5, 190, 101], [120, 153, 180, 157.5], [300, 260, 300, 400], [110, 120, 190, 120.0]])
     seen = SimpleNamespace(image_idx=np.array([4, 4, 4]), line_idx=np.array([7, 8, 9]), segment=observed)
     pose = SimpleNamespace(line_inliers=np.ones(4, bool), matches=SimpleNamespace(segments2d=query))
-    found = SimpleNamespace(pose=pose, line=np.array([30, 31, 32, 33]))
-    pairs = _same_lines(SimpleNamespace(scene=SimpleNamespace(line_observations=seen)), 4, found)
+    found: Any = SimpleNamespace(pose=pose, line=np.array([30, 31, 32, 33]))
+    second: Any = SimpleNamespace(scene=SimpleNamespace(line_observations=seen))
+    pairs = _same_lines(second, 4, found)
     assert pairs.tolist() == [[7, 30], [8, 31]]
 
 
@@ -195,7 +198,7 @@ def test_noise_of_a_line_across_its_ends():
     step = moved[:, 1] - moved[:, 0]
     unit = step / np.linalg.norm(step, axis=1, keepdims=True)
     lines = np.concatenate([np.cross(moved[:, 0], unit), unit], axis=1)
-    assert _line_sigma(ends[None], np.cov(lines.T)[None])[0] == pytest.approx(0.01, rel=0.03)
+    assert _line_sigma(ends[None], np.cov(lines.T).astype(np.float64)[None])[0] == pytest.approx(0.01, rel=0.03)
 
 
 def test_a_folder_of_links_holds_nothing_else(tmp_path):

@@ -14,7 +14,8 @@ from groma.features.registry import DETECTORS, RETRIEVAL
 from groma.features.retrieval import GradientRetrieval, most_similar
 from groma.mapping.checkpoints import digest
 from groma.mapping.exchange import matches_for, neighbors_for, similar_neighbors, with_parts
-from groma.mapping.lines.build import MapLinesOptions, map_lines
+from groma.mapping.lines.build import map_lines
+from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.map import MapOptions, map_images
 from groma.scene import PointObservations, Points
 from groma.testing import check_detector, check_matcher, check_retrieval

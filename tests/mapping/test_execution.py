@@ -29,7 +29,8 @@ from groma.execution import (
     num_workers,
     work_with,
 )
-from groma.mapping.lines.build import MapLinesOptions, map_lines
+from groma.mapping.lines.build import map_lines
+from groma.mapping.lines.options import MapLinesOptions
 
 
 def processes() -> ProcessPoolExecutor:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from _comparison import equal
 
-from groma.adjustment.assemble import AssemblyOptions, assemble, disassemble
+from groma.adjustment.assemble import assemble, disassemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.errors import InputError
 from groma.geometry import quaternion
 from groma.io import read_scene

@@ -8,7 +8,10 @@ from _wireframe import Wireframe, arc, random_lines, true_lines, wireframe
 from groma.adjustment.rescue.restart import with_seen_ends
 from groma.features.segments import Segments
 from groma.geometry import quaternion
-from groma.mapping.lines.build import LineMap, MapLinesOptions, Outcome, map_lines
+from groma.mapping.lines.build import map_lines
+from groma.mapping.lines.line_map import LineMap
+from groma.mapping.lines.options import MapLinesOptions
+from groma.mapping.lines.outcomes import Outcome
 
 
 def flipped(world: Wireframe, images: range) -> list[Segments]:
@@ -22,7 +25,7 @@ def flipped(world: Wireframe, images: range) -> list[Segments]:
 def test_an_edge_whose_darker_side_changes_is_one_line():
     rng = np.random.default_rng(21)
     world = wireframe(arc(12), random_lines(12, rng), rng)
-    found = map_lines(world.scene, flipped(world, range(6, 12)), options=MapLinesOptions(use_points=False))
+    found = map_lines(world.scene, flipped(world, range(6, 12)))
     true = true_lines(world, found)
     assert (true >= 0).all()
     assert len(np.unique(true)) == len(true) >= 10

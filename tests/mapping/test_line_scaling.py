@@ -10,8 +10,8 @@ from _comparison import equal
 
 from groma.cli.commands.map import map_
 from groma.mapping.groups import distinct_pairs, num_distinct
-from groma.mapping.lines.build import LineMap, explain
 from groma.mapping.lines.gates import AGREEMENT
+from groma.mapping.lines.line_map import LineMap, explain
 from groma.mapping.lines.linking import merge as _line_merge
 from groma.mapping.lines.linking.merge import MergeGates
 from groma.mapping.lines.outcomes import REMEDIES, WORDS, Outcome

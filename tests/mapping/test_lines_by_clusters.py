@@ -10,10 +10,11 @@ import pytest
 from _wireframe import arc, distance_to_truth, random_lines, true_lines, wireframe
 
 from groma.execution import work_with
-from groma.mapping.lines.build import MapLinesOptions, map_lines
+from groma.mapping.lines.build import map_lines
 from groma.mapping.lines.hypotheses.earlier import EarlierMap
 from groma.mapping.lines.linking import borders as _borders
 from groma.mapping.lines.linking.borders import Borders
+from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.outcomes import Outcome
 
 AT_ONCE = MapLinesOptions(num_neighbors=4)

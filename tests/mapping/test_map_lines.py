@@ -13,20 +13,16 @@ from groma.features import ExternalMatches, LsdDetector
 from groma.features.matches import LineMatches
 from groma.features.segments import Segments
 from groma.geometry import quaternion
-from groma.mapping.lines.build import (
-    LineMap,
-    MapLinesOptions,
-    Outcome,
-    explain,
-    external_matches,
-    map_lines,
-    segment_matches,
-)
+from groma.mapping.lines.build import map_lines
 from groma.mapping.lines.filtering.filters import is_certain
 from groma.mapping.lines.hypotheses.directions import depth_ratios
 from groma.mapping.lines.hypotheses.proposals import Proposer, Questions, angles_about_baseline
+from groma.mapping.lines.line_map import LineMap, explain
 from groma.mapping.lines.linking.tracks import Tracks
+from groma.mapping.lines.matches import external_matches, segment_matches
 from groma.mapping.lines.neighbors import covisible_neighbors
+from groma.mapping.lines.options import MapLinesOptions
+from groma.mapping.lines.outcomes import Outcome
 from groma.mapping.lines.views import build_views
 from groma.scene import Cameras, Scene
 from groma.scene.similarity import Similarity

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import groma
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.errors import InputError
 from groma.evaluation import evaluate_poses

@@ -231,3 +231,6 @@ def test_poses_that_are_held_stay(photographed, tmp_path, monkeypatch):
     found = read_scene(tmp_path / "out" / "scene.npz")
     assert found.num_points > 100
     np.testing.assert_allclose(found.cam_from_world, scene.cam_from_world, atol=1e-9)
+    told = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert told["estimated"]["poses"] is False
+    assert told["pose_uncertainty"] is None

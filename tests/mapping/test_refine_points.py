@@ -6,6 +6,7 @@ import pytest
 
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.errors import InputError
+from groma.execution import work_with
 from groma.geometry import quaternion, se3
 from groma.io import read_scene, write_scene
 from groma.mapping import refine_points as refining
@@ -87,18 +88,14 @@ def test_observations_of_a_point_agree_to_a_few_hundredths_of_a_pixel(world):
     assert rms[1] < 0.35 * rms[0]
 
 
-def test_points_in_chunks_and_threads_give_the_same(world):
+def test_points_in_chunks_and_threads_give_the_same(world, monkeypatch):
     _, noisy, images = world
-    once = refine_points(noisy, images.__getitem__, NOISE, refining.PointRefinementOptions(threads=1))
+    with work_with(1):
+        once = refine_points(noisy, images.__getitem__, NOISE)
     seen = []
-    again = refine_points(
-        noisy,
-        images.__getitem__,
-        NOISE,
-        refining.PointRefinementOptions(threads=2),
-        lambda done, total: seen.append((done, total)),
-        refining.PointRefinementGates(points_at_once=40),
-    )
+    monkeypatch.setattr(refining, "GATES", refining.PointRefinementGates(points_at_once=40))
+    with work_with(2):
+        again = refine_points(noisy, images.__getitem__, NOISE, lambda done, total: seen.append((done, total)))
     np.testing.assert_array_equal(again.scene.point_observations.pixel, once.scene.point_observations.pixel)
     np.testing.assert_array_equal(again.scene.point_observations.sigma, once.scene.point_observations.sigma)
     assert seen[-1] == (64, 64)  # four chunks, eight images, each read twice

@@ -4,7 +4,8 @@
 import numpy as np
 import pytest
 
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.factors.losses import Cauchy
 from groma.problem import parallel
 from groma.problem.lay_out import lay_out

@@ -12,8 +12,8 @@ import numpy as np
 from groma._counted import counted
 from groma._log import log_warnings, logger_of
 from groma._typing import FloatArray
-from groma.adjustment.assemble import Assembly, AssemblyOptions, assemble, disassemble
-from groma.adjustment.assembly_options import SURFACE_SIGMA_PX
+from groma.adjustment.assemble import Assembly, assemble, disassemble
+from groma.adjustment.assembly_options import SURFACE_SIGMA_PX, AssemblyOptions
 from groma.adjustment.fit import inliers, noise_of
 from groma.adjustment.misfit.calibration import doubtful_cameras, refuse_focal_lengths
 from groma.adjustment.misfit.lens import unmodelled_distortion
@@ -89,19 +89,20 @@ class AdjustOptions:
     #: the scene are relative to it. Losses are scaled in these units.
     point_sigma_px: float = 1.0
     line_sigma_px: float = 1.0
-    #: Correlation of the errors of a segment's two ends: see :class:`groma.adjustment.assemble.AssemblyOptions`.
+    #: Correlation of the errors of a segment's two ends:
+    #: see :class:`groma.adjustment.assembly_options.AssemblyOptions`.
     line_end_correlation: float = 0.0
     #: How segments and measured planes are compared with landmarks: ``endpoints``, ``bearing`` or ``normal``, and
-    #: ``normal_offset`` or ``quaternion``: see :class:`groma.adjustment.assemble.AssemblyOptions`.
+    #: ``normal_offset`` or ``quaternion``: see :class:`groma.adjustment.assembly_options.AssemblyOptions`.
     line_residual: str = "endpoints"
     plane_residual: str = "normal_offset"
     #: Kinds of measurements from outside: see :mod:`groma.adjustment.terms.contract`.
     terms: tuple[Term, ...] = ()
     #: How relations between landmarks are measured: ``metric`` or ``pixels``, and how well they hold if metric: see
-    #: :class:`groma.adjustment.assemble.AssemblyOptions`.
+    #: :class:`groma.adjustment.assembly_options.AssemblyOptions`.
     structure_form: str = "metric"
     structure_sigma_px: float = SURFACE_SIGMA_PX
-    #: Hold lines together that meet: see :class:`groma.adjustment.assemble.AssemblyOptions`.
+    #: Hold lines together that meet: see :class:`groma.adjustment.assembly_options.AssemblyOptions`.
     meeting_lines: bool = False
     #: Most steps tried (cost: time; most end before).
     max_iterations: int = 50
@@ -115,7 +116,7 @@ class AdjustOptions:
     linear_solver: str = "auto"
     #: ``cartesian``, ``orthonormal_right``, ``orthonormal_left``, ``free_right`` or ``free_left``.
     line_chart: str = "cartesian"
-    #: ``auto``, ``free`` or ``first_camera``: see :class:`groma.adjustment.assemble.AssemblyOptions`.
+    #: ``auto``, ``free`` or ``first_camera``: see :class:`groma.adjustment.assembly_options.AssemblyOptions`.
     gauge: str = "auto"
     #: Steps of each landmark on its own after every joint step; None: 2 under a robust loss or with lines (1 where
     #: points are tied to lines and there is no loss), else 0.

@@ -35,7 +35,6 @@ from groma.adjustment.terms import (
     right_columns,
 )
 from groma.adjustment.terms.contract import Draft, Group, Term
-from groma.adjustment.terms.lines import LINE_FACTORS
 from groma.adjustment.terms.objects import with_held
 from groma.adjustment.terms.open_motions import coordinates_to_hold
 from groma.adjustment.terms.readout import MOTIONS
@@ -306,21 +305,3 @@ def point_variables(scene: Scene, chart_name: str = "auto") -> Variables:
     far = np.linalg.norm(scene.points.xyz - anchor, axis=1) > FAR_FROM_CAMERAS * spread
     chart = InverseDepthPoint()
     return Variables(chart, chart.anchored(scene.points.xyz, anchor, far.astype(np.float64)))
-
-
-__all__ = [
-    "FAR_FROM_CAMERAS",
-    "LINE_FACTORS",
-    "POINT_FACTORS",
-    "TERMS",
-    "Assembly",
-    "AssemblyOptions",
-    "assemble",
-    "camera_variables",
-    "disassemble",
-    "first_camera_gauge",
-    "gauge_of",
-    "observations_of_frames",
-    "point_variables",
-    "structure_variables",
-]

@@ -31,7 +31,8 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from groma._typing import FloatArray
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.consistency_scenes import STRUCTURE_SIGMA_PX, drawn
 from groma.errors import InputError
 from groma.problem.problem import Problem

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.places import at_places_of
 from groma.adjustment.terms.open_motions import num_open_motions
 from groma.problem.problem import Problem

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.adjustment.assemble import AssemblyOptions, assemble, first_camera_gauge
+from groma.adjustment.assemble import assemble, first_camera_gauge
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.places import at_places_of
 from groma.adjustment.terms.objects import with_held
 from groma.errors import InputError, ProblemError

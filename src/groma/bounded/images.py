@@ -8,17 +8,14 @@ any other kind, whatever the name of the file says.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from groma.bounded.content import READING
 from groma.errors import FileFormatError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 #: Markers of JPEG that hold the size: all starts of frames, of which C4, C8 and CC are none.
 _FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}

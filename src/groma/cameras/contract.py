@@ -317,38 +317,6 @@ class CameraModel:
         adjugate = np.stack([b, -c, -c, a], axis=-1).reshape(-1, 2, 2)
         return bearings, np.swapaxes(J, 1, 2) @ (adjugate / determinant[:, None, None])
 
-    def bearing_covariance(
-        self, params: FloatArray, pixels: FloatArray, sigma: float | FloatArray = 1.0
-    ) -> tuple[FloatArray, FloatArray]:
-        r"""Bearings and the covariance that pixel noise gives them.
-
-        .. math:: \Sigma_f = G\, \Sigma_u\, G^\top, \qquad G = \partial f/\partial u
-
-        A residual :math:`n^\top f` of a fixed plane normal then has the variance :math:`n^\top \Sigma_f\, n`.
-
-        Parameters
-        ----------
-        params : (k,) or (N, k) float64
-            Camera parameters.
-        pixels : (N, 2) float64
-            Pixels.
-        sigma : float, (N,) or (N, 2, 2) float64
-            Noise of the pixels: a standard deviation per coordinate in pixels, or covariances in square pixels.
-
-        Returns
-        -------
-        bearings : (N, 3) float64
-        covariances : (N, 3, 3) float64
-            Square radians, of rank 2: the bearing itself is in the null space. NaN where there is no bearing.
-        """
-        bearings, G = self.bearing_jacobian(params, pixels)
-        sigma = np.asarray(sigma, dtype=np.float64)
-        if sigma.shape in ((), (len(G),)):
-            return bearings, (sigma**2).reshape(-1, 1, 1) * (G @ np.swapaxes(G, 1, 2))
-        if sigma.shape != (len(G), 2, 2):
-            raise ShapeError(f"sigma must be a number, (N,) or (N, 2, 2) with N = {len(G)} pixels; got {sigma.shape}.")
-        return bearings, G @ sigma @ np.swapaxes(G, 1, 2)
-
     def check_parameters(self, params: FloatArray, count: int | None = None) -> FloatArray:
         """Return ``params`` as contiguous rows (1, k) or (N, k); raise ShapeError unless they fit ``count`` items."""
         rows = np.atleast_2d(self._as_params(params))

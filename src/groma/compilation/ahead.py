@@ -21,7 +21,7 @@ from importlib import import_module
 from typing import Any
 
 from groma._kernels import cache as kernel_cache
-from groma.compilation.needed import IMPORTS, function, needed
+from groma.compilation.needed import function, imported, needed
 
 #: How many processes, if the user says so; 0 for none.
 VARIABLE = "GROMA_COMPILE_PROCESSES"
@@ -110,8 +110,8 @@ def make_ready(work: str) -> None:
     from numba.core.registry import cpu_target as target
 
     cpu_target: Any = target
-    if work in IMPORTS:
-        import_module(IMPORTS[work])
+    if (module_of_work := imported(work)) is not None:
+        import_module(module_of_work)
     for module, name, _ in needed(work):
         function(module, name)
     cpu_target.typing_context.refresh()
@@ -122,8 +122,8 @@ def compile_ahead(work: str) -> None:
     """Compile what some work calls, other than what is there or is being compiled."""
     from numba.core.registry import cpu_target
 
-    if work in IMPORTS:
-        import_module(IMPORTS[work])
+    if (module_of_work := imported(work)) is not None:
+        import_module(module_of_work)
     for module, name, kinds in needed(work):
         compiled = function(module, name)
         if compiled is not None and not compiled._cache.is_there(kinds, cpu_target.target_context):

@@ -10,6 +10,7 @@ too few is compiled when it is called.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -27,6 +28,8 @@ IMPORTS = {
     "localize": "groma.localization.run",
     "pose graph": "groma.adjustment.graphs.pose_graph",
 }
+#: Adjustments of points alone have lists of their own, one for each camera model: half as long.
+_POINTS = "adjust points"
 #: Module, name, argument types.
 Entry = tuple[str, str, tuple[Any, ...]]
 
@@ -34,6 +37,22 @@ Entry = tuple[str, str, tuple[Any, ...]]
 def works() -> tuple[str, ...]:
     """Return the kinds of work that are listed."""
     return tuple(json.loads(PLACE.read_text(encoding="utf-8"))["work"])
+
+
+def points_of(model: str, is_estimated: bool) -> str:
+    """Return the name of the work of adjusting points alone, seen by cameras of one model."""
+    return f"{_POINTS}, {model}{', calibration estimated' if is_estimated else ''}"
+
+
+def adjusting(models: Iterable[str], is_estimated: bool, has_points_alone: bool) -> str:
+    """Return the name of the list that suits an adjustment best."""
+    names = [points_of(model, is_estimated) for model in set(models)]
+    return names[0] if has_points_alone and len(names) == 1 and names[0] in works() else "adjust"
+
+
+def imported(work: str) -> str | None:
+    """Return the module that some work imports."""
+    return IMPORTS.get("adjust" if work.startswith(_POINTS) else work)
 
 
 def needed(work: str) -> list[Entry]:

@@ -41,15 +41,15 @@ def _adjust_steps() -> Steps:
 
     yield "projection", _project
     for name in HELD:
-        yield f"{name}, calibration held", step(_with_model(start, name))
+        yield f"{name}, calibration held", step(with_model(start, name))
     yield "landmarks alone", step(start, refine_poses=False)
     yield "points alone", step(start.points_only())
     for solver in ("sparse", "pcg"):
         yield f"{solver} solver", step(start, linear_solver=solver)
     yield "relations in pixels", step(start, structure_form="pixels")
     for name in ESTIMATED:
-        yield f"{name}, calibration estimated", step(_with_model(start, name), refine_intrinsics=True)
-    own = _with_own_cameras(start.points_only(), "BAL")
+        yield f"{name}, calibration estimated", step(with_model(start, name), refine_intrinsics=True)
+    own = with_own_cameras(start.points_only(), "BAL")
     for solver in ("dense", "pcg"):
         yield f"BAL, {solver} solver", step(own, loss="none", linear_solver=solver)
 
@@ -62,12 +62,12 @@ def _project() -> None:
         camera.unproject(params[0], pixels)
 
 
-def _with_model(scene: Scene, name: str) -> Scene:
+def with_model(scene: Scene, name: str) -> Scene:
     """Return a scene whose one camera has another model, without distortion."""
     return scene.replace(cameras=_cameras(name, 1))
 
 
-def _with_own_cameras(scene: Scene, name: str) -> Scene:
+def with_own_cameras(scene: Scene, name: str) -> Scene:
     """Return a scene in which each image has a camera of its own."""
     return Scene.from_images(
         _cameras(name, scene.num_images),

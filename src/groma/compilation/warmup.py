@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 from groma._kernels import cache as kernel_cache
-from groma.compilation import runs
 from groma.errors import InputError, OutputError
 
 PARTS = ("adjust", "map", "track")
@@ -85,6 +84,8 @@ def warm_up(
 
 def _run(part: str, progress: Callable[[str, int, int], None], unsaved: int) -> None:
     """Run a part, and note which files it used if all of them could be kept."""
+    from groma.compilation import runs  # what is to be run, and all that it imports
+
     steps = list(runs.RUNS[part]())
     for number, (name, step) in enumerate(steps):
         progress(f"{part}: {name}", number, len(steps))

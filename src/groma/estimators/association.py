@@ -20,7 +20,7 @@ import math
 import numpy as np
 import scipy  # its parts are imported when something of them is first used
 
-from groma._numba import loop
+from groma._numba import exact_kernel, loop
 from groma._typing import FloatArray, IntArray
 from groma.errors import ShapeError
 
@@ -31,20 +31,32 @@ ROUNDS = 30
 MAX_SQUARE = 1400.0
 
 
+@exact_kernel
+def _expected(noise, clutter, begin, end, share, probability):
+    """Probabilities of the features from ``begin`` to before ``end``, and their sum, always in this order."""
+    total = 0.0
+    for n in range(begin, end):
+        inner = share * noise[n]
+        probability[n] = inner / (inner + (1.0 - share) * clutter[n])
+        total += probability[n]
+    return total
+
+
 @loop
-def _maximise(noise, clutter, owner, count, pooled, common, rounds, share, probability):
-    """Expectation and maximisation, by turns: probabilities (N,) and shares (K,)."""
-    total = np.zeros(len(share))
-    for _ in range(rounds):
-        total[:] = 0.0
-        for n in range(len(noise)):
-            k = owner[n]
-            inner = share[k] * noise[n]
-            p = inner / (inner + (1.0 - share[k]) * clutter[n])
-            probability[n] = p
-            total[k] += p
-        for k in range(len(share)):
-            share[k] = (total[k] + pooled * common) / (count[k] + pooled)
+def _maximise(noise, clutter, first, pooled, common, rounds, share, probability):
+    """Expectation and maximisation, by turns: probabilities (N,) and shares (K,).
+
+    The features of structure k are those from ``first[k]`` to ``first[k + 1]``. Once its share stays the same, to the
+    last digit, so does all that would follow.
+    """
+    for k in range(len(share)):
+        count = first[k + 1] - first[k]
+        for _ in range(rounds):
+            before = share[k]
+            total = _expected(noise, clutter, first[k], first[k + 1], before, probability)
+            share[k] = (total + pooled * common) / (count + pooled)
+            if share[k] == before:
+                break
 
 
 def inlier_probability(
@@ -87,16 +99,18 @@ def inlier_probability(
     spread = np.maximum(sigma, 1e-12 * band[owner] if len(band) else 0.0)
     noise = np.sqrt(2.0 / np.pi) / spread * np.exp(-0.5 * np.minimum((distance / spread) ** 2, MAX_SQUARE))
     clutter = 1.0 / band[owner] if len(band) else np.zeros(0)
-    count = np.bincount(owner, minlength=len(band))
     if pooled > 0.0 and len(distance):
         _, shares = inlier_probability(distance / band[owner], spread / band[owner], np.zeros_like(owner), np.ones(1))
         common = float(shares[0])
     else:
         common, pooled = 0.5, 2.0
-    share = np.full(len(band), 0.5)
-    probability = np.zeros(len(distance))
+    share, order = np.full(len(band), 0.5), np.argsort(owner, kind="stable")
+    sorted_probability, probability = np.zeros(len(distance)), np.zeros(len(distance))
     # Some features in advance keep small structures from extremes.
-    _maximise(noise, clutter, owner.astype(np.int64), count, pooled, common, ROUNDS, share, probability)
+    _maximise(
+        noise[order], clutter[order], _firsts(owner, len(band)), pooled, common, ROUNDS, share, sorted_probability
+    )
+    probability[order] = sorted_probability
     return probability, share
 
 
@@ -107,11 +121,18 @@ def maximise_shares(
 
     The share of all structures together counts ``pooled`` features in that of each.
     """
-    together, probability = np.full(1, 0.5), np.zeros(len(density))
-    _maximise(density, clutter, np.zeros_like(owner), np.array([len(owner)]), 1.0, 0.5, rounds, together, probability)
-    share, count = np.full(num, float(together[0])), np.bincount(owner, minlength=num)
-    _maximise(density, clutter, owner, count, pooled, float(together[0]), rounds, share, probability)
+    order = np.argsort(owner, kind="stable")
+    density, clutter, probability = density[order], clutter[order], np.zeros(len(density))
+    common = np.full(1, 0.5)
+    _maximise(density, clutter, np.array([0, len(owner)]), 1.0, 0.5, rounds, common, probability)
+    share = np.full(num, float(common[0]))
+    _maximise(density, clutter, _firsts(owner, num), pooled, float(common[0]), rounds, share, probability)
     return share
+
+
+def _firsts(owner: IntArray, num: int) -> IntArray:
+    """Where the features of each structure begin, those of the first at first, and the number of all (K + 1,)."""
+    return np.r_[0, np.cumsum(np.bincount(owner, minlength=num))]
 
 
 def log10_poisson_tail(count: float, mean: float) -> float:

@@ -60,15 +60,13 @@ def as_numbers(scores: Any, *left_out: str) -> dict[str, object]:
     return result
 
 
-def evaluate_poses(estimate: Scene, reference: Scene, with_scale: bool = True) -> PoseScores:
-    """Compare the camera poses of two scenes; images are matched by name.
+def evaluate_poses(estimate: Scene, reference: Scene) -> PoseScores:
+    """Compare the camera poses of two scenes, aligned by a similarity; images are matched by name.
 
     Parameters
     ----------
     estimate, reference : Scene
         The scene to judge, and the one taken for true.
-    with_scale : bool
-        Align with a similarity; otherwise with a rigid motion.
 
     Raises
     ------
@@ -94,7 +92,7 @@ def evaluate_poses(estimate: Scene, reference: Scene, with_scale: bool = True) -
         )
     estimated = estimate.cam_from_world[[rows[0][name] for name in common]]
     true = reference.cam_from_world[[rows[1][name] for name in common]]
-    scores = score_poses(estimated, true, with_scale, num_missing=reference.num_images - len(common))
+    scores = score_poses(estimated, true, num_missing=reference.num_images - len(common))
     least = min(scene.num_images for scene in (estimate, reference))
     if len(common) >= SCORES.associated * least:
         return scores

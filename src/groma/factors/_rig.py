@@ -297,7 +297,7 @@ class CameraFactor(Factor):
             record[:, row], degenerate = again[:, row], max(degenerate, found)
         return degenerate
 
-    @property
+    @cached_property
     def _nothing_wanted(self) -> tuple[int, ...]:
         return (-1,) * sum(slot not in (EXTRINSICS, MOTION) for slot in self.slots)
 

@@ -45,12 +45,12 @@ class ExternalMatches:
             return self.matches[second, first].swapped()
         return LineMatches.empty()
 
-    def segments_of(self, name: str, image: npt.NDArray[np.generic], fit: bool = False) -> Segments:
+    def segments_of(self, name: str, image: npt.NDArray[np.generic]) -> Segments:
         """Segments of an image in the file's order, directed by the grey levels, with sigma and strength measured.
 
-        With ``fit`` the end points are moved across the segment to the edge. An image the file does not name has none.
+        An image the file does not name has none.
         """
-        ends, sigma, strength = measure_edges(to_gray(image), self.segments.get(name, np.zeros((0, 4))), fit=fit)
+        ends, sigma, strength = measure_edges(to_gray(image), self.segments.get(name, np.zeros((0, 4))), fit=False)
         return Segments(ends, sigma, strength)
 
 

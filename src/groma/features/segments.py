@@ -78,13 +78,13 @@ class Segments:
         return Segments(self.ends[rows], self.sigma[rows], self.strength[rows])
 
     @staticmethod
-    def from_ends(ends: FloatArray, sigma: float = 0.3, strength: float = 0.0) -> Segments:
-        """Segments from end points (N, 4) of another detector, with one sigma in pixels and one strength for all.
+    def from_ends(ends: FloatArray, sigma: float = 0.3) -> Segments:
+        """Segments from end points (N, 4) of another detector, with one sigma in pixels for all.
 
         Their direction is kept as given; the darker side must lie on the left where matching is to use it.
         """
         ends = np.asarray(ends, dtype=np.float64).reshape(-1, 4)
-        return Segments(ends, np.full(len(ends), float(sigma)), np.full(len(ends), float(strength)))
+        return Segments(ends, np.full(len(ends), float(sigma)), np.zeros(len(ends)))
 
     @staticmethod
     def empty() -> Segments:

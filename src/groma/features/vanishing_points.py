@@ -22,7 +22,7 @@ import numpy as np
 from groma._typing import FloatArray, IntArray
 from groma.cameras import CameraModel
 from groma.errors import ShapeError
-from groma.estimators.directions import DirectionOptions, directions_from_normals
+from groma.estimators.directions import directions_from_normals
 from groma.geometry.algebra import dot, norm, ratio, vectors
 
 #: Segments whose ends are closer than this have no normal, radians.
@@ -108,7 +108,6 @@ def find_vanishing_points(
     sigma: float | FloatArray,
     model: CameraModel,
     params: FloatArray,
-    options: DirectionOptions | None = None,
 ) -> VanishingPoints:
     """Find the vanishing points of an image.
 
@@ -116,8 +115,6 @@ def find_vanishing_points(
     ----------
     ends, sigma, model, params
         As for :func:`segment_normals`.
-    options : DirectionOptions, optional
-        What counts as a vanishing point.
 
     Returns
     -------
@@ -131,7 +128,7 @@ def find_vanishing_points(
     """
     normals, factors = segment_normals(ends, sigma, model, params)
     good = np.flatnonzero(dot(normals, normals) > 0.0)
-    found = directions_from_normals(normals[good], factors[good], options)
+    found = directions_from_normals(normals[good], factors[good])
     label = np.full(len(normals), -1)
     label[good] = found.label
     front = np.where(found.vectors[:, 2:] < 0.0, -1.0, 1.0)

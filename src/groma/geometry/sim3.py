@@ -225,24 +225,3 @@ def right_jacobian(zeta: FloatArray) -> FloatArray:
 def right_jacobian_inverse(zeta: FloatArray) -> FloatArray:
     """Inverse of :func:`right_jacobian`, (..., 7, 7); singular at an angle of 2 pi."""
     return left_jacobian_inverse(-_tangents(zeta))
-
-
-__all__ = [
-    "adjoint",
-    "apply",
-    "compose",
-    "exp",
-    "from_matrix",
-    "from_parts",
-    "hat",
-    "identity",
-    "inverse",
-    "left_jacobian",
-    "left_jacobian_inverse",
-    "log",
-    "right_jacobian",
-    "right_jacobian_inverse",
-    "to_matrix",
-    "to_parts",
-    "vee",
-]

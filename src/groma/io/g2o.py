@@ -41,6 +41,7 @@ from pathlib import Path
 
 import numpy as np
 
+from groma._counted import counted
 from groma._typing import FloatArray, IntArray
 from groma.bounded.text import finite, read_words
 from groma.errors import FileFormatError
@@ -251,7 +252,7 @@ def _graph(rows: dict[str, array[float]], path: Path) -> PoseGraph:
             index[:, 0],
             index[:, 1],
             _from_planar(motion) if planar else _from_file_order(motion, edge, path),
-            _information(edges[:, 2 + width :], planar, path),
+            _information(edges[:, 2 + width :], planar, named.reshape(-1, 2), path),
         ),
         planar,
     )
@@ -265,16 +266,21 @@ def _integers(values: FloatArray, path: Path) -> IntArray:
     return values.astype(np.int64)
 
 
-def _information(upper: FloatArray, planar: bool, path: Path) -> FloatArray:
-    """Return the information (E, 6, 6) in radians from the upper triangles of the file."""
+def _information(upper: FloatArray, planar: bool, between: IntArray, path: Path) -> FloatArray:
+    """Return the information (E, 6, 6) in radians from the upper triangles of the file; ``between`` are ids (E, 2)."""
     size = 3 if planar else 6
     small = np.zeros((len(upper), size, size))
     rows, columns = np.triu_indices(size)
     small[:, rows, columns] = small[:, columns, rows] = upper
     eigenvalues = np.linalg.eigvalsh(small)
-    if len(small) and (eigenvalues[:, 0] < -1e-9 * np.abs(eigenvalues).max(axis=1)).any():
-        bad = int(np.argmin(eigenvalues[:, 0]))
-        raise FileFormatError(f"{path}: the information of motion {bad} is not positive semidefinite.")
+    indefinite = np.flatnonzero(eigenvalues[:, 0] < -1e-9 * np.abs(eigenvalues).max(axis=1))
+    if len(indefinite):
+        first, second = between[indefinite[0]].tolist()
+        raise FileFormatError(
+            f"{path}: the information of {len(indefinite):,} of {counted(len(small), 'motions')} is not positive "
+            f"semidefinite, the first from {first} to {second}; no noise is like that. Were rows and columns put in "
+            "another order than x, y, z and then the turns, or covariances written? Correct them."
+        )
     if not planar:
         return small * (_HALF_ANGLES[:, None] * _HALF_ANGLES)
     full = np.zeros((len(upper), 6, 6))

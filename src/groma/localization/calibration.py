@@ -95,8 +95,7 @@ def calibration_of(
             return Calibration(of_map, False)
     if focal is None:
         return Calibration(None, True)
-    start = unknown_camera(*size)
-    return Calibration(QueryCamera(start.model, np.array([focal, *start.params[1:]]), *size), True)
+    return Calibration(unknown_camera(*size, focal), True)
 
 
 def _focal_length(path: Path) -> float | None:

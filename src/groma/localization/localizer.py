@@ -304,10 +304,11 @@ def photographs_of(map_: str | os.PathLike[str], images: str | os.PathLike[str] 
         raise
 
 
-def unknown_camera(width: int, height: int) -> QueryCamera:
-    """Return a camera as wide as its image is long, in a model with one distortion: where an estimate begins."""
-    params = np.array([max(width, height), 0.5 * width, 0.5 * height, 0.0], float)
-    return QueryCamera("SIMPLE_RADIAL", params, width, height)
+def unknown_camera(width: int, height: int, focal: float | None = None) -> QueryCamera:
+    """Return a camera without distortion, by default as wide as its image is long: where an estimate begins."""
+    focal = focal or float(max(width, height))
+    params = np.array([focal, focal, 0.5 * width, 0.5 * height, 0.0, 0.0, 0.0, 0.0])
+    return QueryCamera("OPENCV", params, width, height)
 
 
 def index_file(map_: Path) -> Path:

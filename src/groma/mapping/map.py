@@ -47,16 +47,17 @@ from groma.mapping.checkpoints import Stages, digest, digest_files, stage
 from groma.mapping.depth.segments import with_line_depths
 from groma.mapping.exchange import NeighborChooser, matches_for, neighbors_for, with_parts
 from groma.mapping.image_segments import detect_segments, given_segments
-from groma.mapping.lines.build import LineMap, MapLinesOptions, MatchProvider
 from groma.mapping.lines.confidence import DEFAULT_CONFIDENCE
 from groma.mapping.lines.hypotheses.earlier import EarlierMap
 from groma.mapping.lines.in_views import map_lines_in_views
-from groma.mapping.lines.options import MIN_LENGTH
+from groma.mapping.lines.line_map import LineMap
+from groma.mapping.lines.matches import MatchProvider
+from groma.mapping.lines.options import MIN_LENGTH, MapLinesOptions
 from groma.mapping.noise.observations import line_bend, line_end_correlation, moved_px, noise_px, with_point_noise
 from groma.mapping.noise.shared import with_shared_noise
 from groma.mapping.photographs import check_images, check_number, image_files, image_reader, images_left_out
 from groma.mapping.read_rows import adjust_read_rows, mapped_as_measured, read_by_rows, taken_at_once
-from groma.mapping.refine_points import PointRefinementOptions, refine_points
+from groma.mapping.refine_points import refine_points
 from groma.mapping.result import SCENES_OF_RESULT, MapResult, result_of
 from groma.mapping.start import start_of
 from groma.mapping.structure.find import StructureOptions, find_structure
@@ -303,7 +304,7 @@ def map_segments(
 @stage("points", SCENE, lambda o: (o.refine_poses, o.refine_intrinsics, o.refine_rigs, o.max_iterations))
 def adjust_points(start: Scene, options: MapOptions, say: StageProgress) -> Scene:
     """A model whose poses and points are adjusted with robust losses."""
-    return _adjusted(start, _robust(options), options, say, "adjusting points").scene
+    return _adjusted(start, _robust(options), say, "adjusting points").scene
 
 
 @stage("measured", SCENE)
@@ -313,11 +314,10 @@ def measure_points(folder: Path, points: Scene, options: MapOptions, say: StageP
         points,
         image_reader(folder, points.images.names),
         noise_px(points, "points"),
-        PointRefinementOptions(threads=options.threads),
         partial(say, "measuring points"),
     )
     weighted = dataclasses.replace(_robust(options), point_sigma_px=found.sigma_px)
-    return _adjusted(found.scene, weighted, options, say, "adjusting points again").scene
+    return _adjusted(found.scene, weighted, say, "adjusting points again").scene
 
 
 # From here on every stage depends on all options.
@@ -352,7 +352,7 @@ find_lines_again = stage("final-lines", LINE_MAP)(_find_lines)
 @stage("joint", SCENE)
 def adjust_jointly(scene: Scene, weighted: AdjustOptions, options: MapOptions, say: StageProgress) -> Scene:
     """Poses, points and lines adjusted together, weighted by their noise."""
-    return _adjusted(scene, weighted, options, say, "adjusting points and lines").scene
+    return _adjusted(scene, weighted, say, "adjusting points and lines").scene
 
 
 @stage("structure", SCENE)
@@ -364,13 +364,14 @@ def find_planes(scene: Scene, options: MapOptions, say: StageProgress) -> Scene:
 @stage("adjusted", ADJUSTED)
 def adjust_everything(scene: Scene, weighted: AdjustOptions, options: MapOptions, say: StageProgress) -> AdjustResult:
     """Everything adjusted together."""
-    return _adjusted(scene, dataclasses.replace(weighted, check_lens=True), options, say, "adjusting everything")
+    return _adjusted(scene, dataclasses.replace(weighted, check_lens=True), say, "adjusting everything")
 
 
 # -------------------------------------------------------------------------------------------------------------- helpers
 def _robust(options: MapOptions) -> AdjustOptions:
     """Options of an adjustment of which the scene alone is wanted: the last one asks what the lenses lack."""
     return AdjustOptions(
+        refine_poses=options.refine_poses,
         refine_intrinsics=bool(options.refine_intrinsics),
         refine_rigs=options.refine_rigs,
         max_iterations=options.max_iterations,
@@ -392,9 +393,6 @@ def _weighted(scene: Scene, options: MapOptions) -> AdjustOptions:
     )
 
 
-def _adjusted(
-    scene: Scene, adjust_options: AdjustOptions, options: MapOptions, say: StageProgress, doing: str
-) -> AdjustResult:
-    held = dataclasses.replace(adjust_options, refine_poses=options.refine_poses)
-    say(doing, 0, held.max_iterations)
-    return adjust(scene, held, lambda event: say(doing, event.iteration, event.max_iterations))
+def _adjusted(scene: Scene, adjust_options: AdjustOptions, say: StageProgress, doing: str) -> AdjustResult:
+    say(doing, 0, adjust_options.max_iterations)
+    return adjust(scene, adjust_options, lambda event: say(doing, event.iteration, event.max_iterations))

@@ -23,7 +23,7 @@ import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
-from groma.execution import map_work, work_with
+from groma.execution import map_work
 from groma.features.images import GrayImage
 from groma.features.patch_alignment import SIZE, Alignment, Templates, align_templates, cut_templates, smoothed
 from groma.gates import gate
@@ -43,18 +43,16 @@ class PointRefinementGates:
         "deviation that lens model, shading and surfaces that are not flat leave",
         "chosen on benchmarks/surveyed.py",
     )
+    min_correlation: float = gate(
+        0.8, "1", "of the grey levels of two observations of a point", "convention: four fifths"
+    )
+    max_shift: float = gate(
+        1.5, "px", "correction; a patch found farther away is another one", "convention: keypoints are nearer"
+    )
     points_at_once: int = gate(100_000, "points", "whose templates are held together", "cost: a hundred megabytes")
 
 
-@dataclass(frozen=True)
-class PointRefinementOptions:
-    """Options of :func:`refine_points`."""
-
-    #: Least correlation of the grey levels of two observations of a point.
-    min_correlation: float = 0.8
-    #: Largest correction, pixels; a patch found farther away is another one.
-    max_shift: float = 1.5
-    threads: int | None = None
+GATES = PointRefinementGates()
 
 
 @dataclass(frozen=True)
@@ -75,9 +73,7 @@ def refine_points(
     scene: Scene,
     read: Callable[[int], GrayImage],
     sigma_px: float,
-    options: PointRefinementOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
-    gates: PointRefinementGates = PointRefinementGates(),
 ) -> PointRefinement:
     """Place the point observations of a scene anew by the grey levels around them.
 
@@ -89,12 +85,8 @@ def refine_points(
         Returns the grey image of an image's number; called from several threads.
     sigma_px : float
         Standard deviation of the observations as they are, pixels. What is found less well keeps its place.
-    options : PointRefinementOptions, optional
-        Gates and threads.
     progress : callable, optional
         Called with the number of images read and to be read.
-    gates : PointRefinementGates, optional
-        What no image tells.
 
     Returns
     -------
@@ -110,34 +102,32 @@ def refine_points(
     -----
     Points seen by one image only, near the border, or without texture keep their observations.
     """
-    options = options or PointRefinementOptions()
     if not sigma_px > 0.0:
         raise InputError(f"sigma_px must be positive; got {sigma_px}. Pass the noise of the observations, pixels.")
     table, count = scene.point_observations, scene.num_points
     by_plane, usable = _moves_in_image(scene)
     search = _Search(scene, read, by_plane, usable, _references(scene, by_plane, usable))
     pixel, deviation = table.pixel.copy(), np.full(len(table), np.inf)
-    chunks = [range(first, min(first + gates.points_at_once, count)) for first in range(0, count, gates.points_at_once)]
+    size = GATES.points_at_once
+    chunks = [range(first, min(first + size, count)) for first in range(0, count, size)]
     say = progress or (lambda done, total: None)
 
     def step(number: int) -> Callable[[int, int], None]:
         return lambda done, images: say(number * images + done, 2 * len(chunks) * images)
 
     for k, points in enumerate(chunks):
-        with work_with(options.threads):
-            templates = search.templates(points, step(2 * k))
-            places = search.places(points, templates, step(2 * k + 1))
-        for rows, found in places:
-            spread = np.sqrt(0.5 * np.trace(found.covariance, axis1=1, axis2=2) + gates.sigma_floor**2)
-            good = found.found & (found.correlation >= options.min_correlation) & (spread < sigma_px)
-            good &= norm(found.pixels - table.pixel[rows]) <= options.max_shift
+        templates = search.templates(points, step(2 * k))
+        for rows, found in search.places(points, templates, step(2 * k + 1)):
+            spread = np.sqrt(0.5 * np.trace(found.covariance, axis1=1, axis2=2) + GATES.sigma_floor**2)
+            good = found.found & (found.correlation >= GATES.min_correlation) & (spread < sigma_px)
+            good &= norm(found.pixels - table.pixel[rows]) <= GATES.max_shift
             pixel[rows[good]], deviation[rows[good]] = found.pixels[good], spread[good]
     refined, is_reference = np.isfinite(deviation), search.is_reference()
     defined = (np.bincount(table.point_idx[refined], minlength=count) > 0)[table.point_idx]
     # What kept its place errs against the defining observation, which errs itself.
     deviation[~refined] = np.where(defined[~refined], np.sqrt(2.0) * sigma_px, sigma_px)
     is_reference &= defined
-    deviation[is_reference] = gates.sigma_floor
+    deviation[is_reference] = GATES.sigma_floor
     usual = float(np.median(deviation)) if len(deviation) else sigma_px
     observations = table.replace(pixel=pixel, sigma=deviation / usual)
     return PointRefinement(scene.replace(point_observations=observations), refined, is_reference, usual)

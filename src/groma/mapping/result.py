@@ -14,7 +14,8 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.adjustment.adjust import AdjustOptions
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.contributions import Contribution, contributions
 from groma.adjustment.diagnosis import diagnose_scene
 from groma.adjustment.report import AdjustReport, AdjustResult

@@ -148,6 +148,9 @@ class Draft:
         references = self.factor.references()
         slot, ref = references[self.landmark_reference]
         landmark = position.take(ref.index)
+        if len(position) == 1 and not self.entries:  # nothing to sort by
+            self.landmark = landmark
+            return
         keys = [(landmark, len(position))]
         if self.entries:
             c, block, _ = self.entries[0]

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -37,9 +38,9 @@ def room_for_sums(layout: Layout, compact: bool) -> tuple[list[FloatArray], list
 
 def _in_one_piece(lengths: dict[Any, int]) -> dict[Any, Any]:
     """Return arrays of these lengths, one behind the other."""
-    begin = np.cumsum([0, *(-(-length // _LINE) * _LINE for length in lengths.values())])
-    piece = np.empty(int(begin[-1]))
-    return {key: piece[at : at + length] for (key, length), at in zip(lengths.items(), begin.tolist(), strict=False)}
+    begin = list(accumulate((-(-length // _LINE) * _LINE for length in lengths.values()), initial=0))
+    piece = np.empty(begin[-1])
+    return {key: piece[at : at + length] for (key, length), at in zip(lengths.items(), begin, strict=False)}
 
 
 def room_for_chunks(layout: Layout) -> list[dict[int, Any]]:

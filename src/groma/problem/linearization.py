@@ -74,13 +74,15 @@ class NormalEquations:
                 max(n, min(CHUNK_SIZE, len(f.factor))) for n, f in zip(self._sizes, layout.factors, strict=True)
             ]
         self.shares = shares_of(layout)
+        self._all_runs: dict[int, list[tuple[int, int, int]]] = {}
         self._scratch = threading.local()  # one per thread, not per share: it stays in cache
         self._references = [tuple(ref for _, ref in factor.factor.references()) for factor in layout.factors]
         self._known: dict[str, tuple[FloatArray, FloatArray]] = {}
         self._free = {}
-        for name, group in layout.problem.variables.items():
-            free = group.free_coordinates()
-            if free is not None:
+        for factor, references in zip(layout.factors, self._references, strict=True):
+            for name in {references[reference].group for reference, _, _ in factor.masked} - self._free.keys():
+                free = layout.problem.variables[name].free_coordinates()
+                assert free is not None
                 order = next((e.order for e in layout.eliminated if e.group == name), None)
                 self._free[name] = np.ascontiguousarray(free if order is None else free[order])
         self.V, self.g_landmarks, self.W = room_for_sums(layout, compact)
@@ -136,7 +138,7 @@ class NormalEquations:
 
         def work(share: int) -> tuple[list[float], list[int]]:
             sums, hidden = [0.0] * len(self.layout.factors), [0] * len(self.layout.factors)
-            for f, begin, end in self._runs(share, wanted):
+            for f, begin, end in self._runs_of_all(share) if wanted is None else self._runs(share, wanted):
                 value, rho, degenerate = self._chunk_cost(f, inputs[f], begin, end)
                 sums[f] += value
                 hidden[f] += degenerate
@@ -157,10 +159,15 @@ class NormalEquations:
         """Whether chunks that are wanted hold too few factors to wake another thread for them."""
         return wanted is not None and sum(c.size for c in self.layout.chunks if wanted(c)) < FACTORS_ALONE
 
+    def _runs_of_all(self, share: int) -> list[tuple[int, int, int]]:
+        if share not in self._all_runs:
+            self._all_runs[share] = list(self._runs(share, None))
+        return self._all_runs[share]
+
     def _runs(self, share: int, wanted: Callable[[Chunk], bool] | None) -> Iterator[tuple[int, int, int]]:
         """Yield factor group, begin and end of factors of many chunks: costs need less room than records."""
         runs: dict[int, tuple[int, int]] = {}
-        room = [len(self._record(f)) // (one.factor.residual_size + 1) for f, one in enumerate(self.layout.factors)]
+        room = [self._room_of(f) // (one.factor.residual_size + 1) for f, one in enumerate(self.layout.factors)]
         for chunk in self.shares[share]:
             if wanted is not None and not wanted(chunk):
                 continue
@@ -201,10 +208,13 @@ class NormalEquations:
     def _record(self, f: int) -> FloatArray:
         scratch = self._scratch.__dict__.setdefault("records", {})
         if f not in scratch:
-            layout = self.layout.factors[f]
-            size = self._sizes[f] * (layout.factor.residual_size * layout.width + 1)
-            scratch[f] = np.zeros(size)
+            scratch[f] = np.zeros(self._room_of(f))
         return scratch[f]
+
+    def _room_of(self, f: int) -> int:
+        """Numbers in the records of a chunk of a factor group, and their norms."""
+        layout = self.layout.factors[f]
+        return self._sizes[f] * (layout.factor.residual_size * layout.width + 1)
 
     def linearize(
         self,

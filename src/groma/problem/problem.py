@@ -67,7 +67,8 @@ class Problem:
     def with_states(self, states: Mapping[str, FloatArray]) -> Problem:
         """Return the same problem at other states; groups that are not named keep theirs."""
         variables = {
-            name: group.with_state(states[name]) if name in states else group for name, group in self.variables.items()
+            name: group if states.get(name, group.state) is group.state else group.with_state(states[name])
+            for name, group in self.variables.items()
         }
         if any(len(group) != len(self.variables[name]) for name, group in variables.items()):
             return Problem(variables, self.factors)

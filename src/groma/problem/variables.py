@@ -53,7 +53,8 @@ class Variables:
     @property
     def is_constant(self) -> bool:
         """Whether nothing in this group can move."""
-        return bool(np.all(self.constant)) or len(self) == 0
+        constant = self.constant if isinstance(self.constant, bool | np.bool_) else self.constant.all()
+        return bool(constant) or len(self) == 0
 
     def free_coordinates(self) -> BoolArray | None:
         """Return (count, dof) booleans of the coordinates that may move; None if all may."""

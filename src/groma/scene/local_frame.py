@@ -10,15 +10,12 @@ Whatever is computed is therefore computed near the scene, and its result moved 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from groma._typing import FloatArray
+from groma.scene.scene import Scene
 from groma.scene.similarity import Similarity
-
-if TYPE_CHECKING:
-    from groma.scene.scene import Scene
 
 #: A scene is far from the origin if that is so many times as far as half of its cameras and points from their middle;
 #: and of unusual size if these are so many units, or so many of them a unit, from there (convention: three

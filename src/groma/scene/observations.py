@@ -87,7 +87,7 @@ class Relations:
 
     Each kind may have standard deviations, one for each pair: how far the first is off the second, in scene units;
     angles in radians. Where one is 0 it follows from the noise of the images (see
-    :class:`groma.adjustment.assemble.AssemblyOptions`).
+    :class:`groma.adjustment.assembly_options.AssemblyOptions`).
     """
 
     #: (R, 2) point, plane.

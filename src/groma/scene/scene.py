@@ -276,7 +276,7 @@ class Scene:
         if not self.has_trivial_rigs:
             raise InputError(
                 "with_poses needs a scene in which each frame holds one image; this one has rigs. "
-                "Use with_rig_poses(rig_from_world, cam_from_rig)."
+                "Use with_rig_poses(rig_from_world)."
             )
         rig_from_world, poses = np.empty_like(self.frames.rig_from_world), np.asarray(cam_from_world, float)
         if poses.shape != (self.num_images, 7):
@@ -284,10 +284,9 @@ class Scene:
         rig_from_world[self.images.frame_idx] = poses
         return self.with_rig_poses(rig_from_world)
 
-    def with_rig_poses(self, rig_from_world: npt.ArrayLike, cam_from_rig: npt.ArrayLike | None = None) -> Self:
-        """Return the scene with new poses of its frames, (F, 7), and perhaps of its sensors, (S, 7)."""
-        sensors = self.sensors if cam_from_rig is None else self.sensors.replace(cam_from_rig=cam_from_rig)
-        return self.replace(frames=self.frames.replace(rig_from_world=rig_from_world), sensors=sensors)
+    def with_rig_poses(self, rig_from_world: npt.ArrayLike) -> Self:
+        """Return the scene with new poses of its frames, (F, 7)."""
+        return self.replace(frames=self.frames.replace(rig_from_world=rig_from_world))
 
     def with_params(self, params: npt.ArrayLike) -> Self:
         """Return the scene with new camera parameters, (C, K)."""

@@ -103,24 +103,47 @@ class IndependentBlocks:
         """Forget the dampings of earlier steps, and that variables have converged."""
         self._unfinished = [np.ones(e.count, bool) for e in self.layout.eliminated]
         self._begun = False
+        #: States with what factors read of them, and those whose costs by factor group are in the equations.
+        self._last: tuple[States, list[tuple]] | None = None
+        self._costs_are_of: States | None = None
         self.damping = [np.full(e.count, self._initial_damping) for e in self.layout.eliminated]
         self._growth = [np.full(e.count, 2.0) for e in self.layout.eliminated]
 
-    def _with_any(self, variables: list[BoolArray]) -> Callable[[Chunk], bool]:
-        """Return what tells whether a chunk has any of these variables of each group."""
+    def _with_any(self, variables: list[BoolArray]) -> Callable[[Chunk], bool] | None:
+        """Return what tells whether a chunk has any of these variables of each group; None where they are all."""
+        if all(mine.all() for mine in variables):
+            return None
         found = [np.logical_or.reduceat(mine, begin) for mine, begin in zip(variables, self._begins, strict=True)]
         those = {(e, at) for e, any_of in enumerate(found) for at in self._begins[e][any_of].tolist()}
         return lambda chunk: (chunk.eliminated, chunk.begin) in those
 
     def costs(self, states: States, known: list[FloatArray] | None = None) -> list[FloatArray]:
         """Return the cost of each variable of each group; where it has converged, that of ``known`` if given."""
-        costs = [np.zeros(e.count) for e in self.layout.eliminated]
-        self.equations.cost(
-            self.equations.prepare(states), costs, None if known is None else self._with_any(self._unfinished)
-        )
-        if known is not None:
+        wanted = None if known is None else self._with_any(self._unfinished)
+        costs = self._evaluated(states, wanted)
+        if known is not None and wanted is not None:
             costs = [np.where(mine, new, old) for mine, new, old in zip(self._unfinished, costs, known, strict=True)]
         return costs
+
+    def _evaluated(self, states: States, wanted: Callable[[Chunk], bool] | None) -> list[FloatArray]:
+        """Return the cost of each variable of each group in chunks that are wanted, 0 in others."""
+        costs = [np.zeros(e.count) for e in self.layout.eliminated]
+        self.equations.cost(self._prepared(states), costs, wanted)
+        self._costs_are_of = states if wanted is None else None
+        return costs
+
+    def _prepared(self, states: States) -> list[tuple]:
+        """Return what factors read of the states, which nobody changes; of those asked for last, what was found."""
+        if self._last is None or self._last[0] is not states:
+            self._last = None  # its memory is free for the next one
+            self._last = states, self.equations.prepare(states)
+        return self._last[1]
+
+    def total(self, states: States) -> float:
+        """Return the cost of all factors; those by factor group are left in the equations."""
+        if self._costs_are_of is not states:
+            self._evaluated(states, None)
+        return float(sum(self.equations.costs))
 
     def step(self, states: States, costs: list[FloatArray]) -> tuple[States, list[FloatArray], BlockProgress]:
         """Try one step of every variable; return the new states, their costs, and how far the variables have come."""
@@ -129,33 +152,41 @@ class IndependentBlocks:
 
     def linearize(self, states: States) -> None:
         """Form and solve the normal equations of all variables that have not converged."""
-        prepared = self.equations.prepare(states)
         wanted = self._with_any(self._unfinished) if self._begun else None
-        self.equations.linearize(states, prepared, self._invert, wanted)
+        self._costs_are_of = None
+        self.equations.linearize(states, self._prepared(states), self._invert, wanted)
         self._begun = True
 
     def largest_gradient(self) -> float:
         """Return the largest component of the gradient, each over the root of its curvature."""
-        return float(np.sqrt(np.max([*self._steepest.values()], initial=0.0)))
+        return float(np.sqrt(np.fromiter(self._steepest.values(), float).max(initial=0.0)))
 
     def advance(self, states: States, costs: list[FloatArray]) -> tuple[States, list[FloatArray], BlockProgress]:
         """Take the step of every variable from where they were linearised, if it lowers the variable's cost."""
         deltas, promised = self._steps()
         moved = self._moved(states, deltas)
         new_costs = self.costs(moved, costs)
-        self._rescale(states, costs, moved, new_costs, deltas, promised)
-        unfinished, squared_length = 0, 0.0
-        for e, group in enumerate(self.layout.eliminated):
-            better = new_costs[e] < costs[e]
-            moved[group.group] = np.where(better[:, None], moved[group.group], states[group.group])
-            decrease = np.where(better, costs[e] - new_costs[e], promised[e])
-            can_go_on = better | (self.damping[e] < self._max_damping)
+        moved = self._rescaled(states, costs, moved, new_costs, deltas, promised)
+        unfinished, squared_length, better = 0, 0.0, []
+        for e in range(len(costs)):
+            better.append(new_costs[e] < costs[e])
+            decrease = np.where(better[e], costs[e] - new_costs[e], promised[e])
+            can_go_on = better[e] | (self.damping[e] < self._max_damping)
             self._unfinished[e] &= can_go_on & (decrease > self._tolerance * costs[e])
             unfinished += int(self._unfinished[e].sum())
-            squared_length += float((np.where(better[:, None], deltas[e], 0.0) ** 2).sum())
-            new_costs[e] = np.where(better, new_costs[e], costs[e])
-            self._adapt(e, better)
-        return moved, new_costs, BlockProgress(unfinished, float(np.sqrt(squared_length)))
+            squared_length += float((np.where(better[e][:, None], deltas[e], 0.0) ** 2).sum())
+            new_costs[e] = np.where(better[e], new_costs[e], costs[e])
+            self._adapt(e, better[e])
+        return self._chosen(better, moved, states), new_costs, BlockProgress(unfinished, float(np.sqrt(squared_length)))
+
+    def _chosen(self, here: list[BoolArray], states: States, others: States) -> States:
+        """Return the states of the variables that are ``here`` in each group, and other states of the rest."""
+        if all(mine.all() for mine in here):
+            return states
+        chosen = dict(states)
+        for group, mine in zip(self.layout.eliminated, here, strict=True):
+            chosen[group.group] = np.where(mine[:, None], states[group.group], others[group.group])
+        return chosen
 
     def _steps(self) -> tuple[list[FloatArray], list[FloatArray]]:
         """Return the steps (count, dof) of each group, and what the quadratic model promises for each variable."""
@@ -194,32 +225,33 @@ class IndependentBlocks:
                 V, g, self.damping[e], 1, chunk.begin, chunk.end, self._N[e], self._h[e], dof
             )
 
-    def _rescale(self, states: States, costs, moved: States, new_costs, deltas, promised) -> None:
-        """Try other lengths for steps whose cost fell otherwise than promised; ``moved``, costs and steps are updated.
+    def _rescaled(self, states: States, costs, moved: States, new_costs, deltas, promised) -> States:
+        """Return what steps lead to that are tried at another length where their cost fell otherwise than promised.
+
+        Those that are better take their place in new costs and steps.
 
         A line seen along its length, or anything else that is bent and has large residuals, may bend the cost up: from
         twice the model's curvature on, full steps jump over the minimum to where the cost is higher, for ever. Damping
         helps little there, because the diagonal says nothing of such a direction.
         """
-        factors = []
+        factors, tried = [], []
         for e in range(len(deltas)):
             decrease = costs[e] - new_costs[e]
             ratio = decrease / np.maximum(promised[e], 1e-300)
             counts = self._unfinished[e] & (np.maximum(np.abs(decrease), promised[e]) > self._tolerance * costs[e])
-            wrong = counts & ((ratio > STRETCH.longer) | (ratio < STRETCH.shorter))
-            factors.append(np.where(wrong, stretch_factor(ratio), 1.0))
-
-        tried = [factor != 1.0 for factor in factors]
-        if not any(map(np.any, tried)):
-            return
+            tried.append(counts & ((ratio > STRETCH.longer) | (ratio < STRETCH.shorter)))
+            factors.append(np.where(tried[e], stretch_factor(ratio), 1.0) if tried[e].any() else np.ones(len(ratio)))
+        if not any(mine.any() for mine in tried):
+            return moved
         other = self._moved(states, [factor[:, None] * delta for factor, delta in zip(factors, deltas, strict=True)])
-        other_costs = [np.zeros(e.count) for e in self.layout.eliminated]
-        self.equations.cost(self.equations.prepare(other), other_costs, self._with_any(tried))
-        for e, group in enumerate(self.layout.eliminated):
-            better = tried[e] & (other_costs[e] < new_costs[e])
-            moved[group.group] = np.where(better[:, None], other[group.group], moved[group.group])
-            deltas[e] = np.where(better[:, None], factors[e][:, None] * deltas[e], deltas[e])
-            new_costs[e] = np.where(better, other_costs[e], new_costs[e])
+        other_costs = self._evaluated(other, self._with_any(tried))
+        better = [
+            mine & (one < all_at_first) for mine, one, all_at_first in zip(tried, other_costs, new_costs, strict=True)
+        ]
+        for e, factor in enumerate(factors):
+            deltas[e] = np.where(better[e][:, None], factor[:, None] * deltas[e], deltas[e])
+            new_costs[e] = np.where(better[e], other_costs[e], new_costs[e])
+        return self._chosen(better, other, moved)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -305,7 +337,7 @@ class IndependentProblem:
         """Write the costs of the present states into the report, and what could not be evaluated or determined."""
         equations = self._blocks.equations
         with self._watch("cost"):
-            report.final_cost = equations.cost(equations.prepare(self.states))
+            report.final_cost = self._blocks.total(self.states)
             equations.num_degenerate = equations.hidden
         note_costs(report, self._layout, equations, self._at_start, self._blocks.num_singular)
 

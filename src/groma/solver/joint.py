@@ -38,7 +38,7 @@ class JointProblem:
             states = to_solver_order(layout)
         self._layout, self._watch = layout, watch
         self._reduction = Reduction(self.equations, self._system, self.linear, watch)
-        self._damping = damping_from(first_damping(layout.problem.variables, options))
+        self._damping = damping_from(first_damping(layout.problem.variables, options), layout.problem.variables)
         inputs = self.equations.prepare(states)
         self._at_start: list[float] = []
         self._sizes = sizes_of(layout, states)

@@ -11,12 +11,13 @@ H. B. Nielsen, *Damping parameter in Marquardt's method*, IMM-REP-1999-05, 1999.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
 
 from groma._typing import FloatArray
+from groma.problem.variables import Variables
 from groma.solver.damped_problem import Trial
 from groma.solver.linear.schur import MIN_DIAGONAL
 from groma.solver.termination import Termination
@@ -24,6 +25,8 @@ from groma.solver.termination import Termination
 MAX_DAMPING = 1e16
 #: A scene that is free to move has a singular system; this much damping keeps its factorisation stable.
 MIN_DAMPING = 1e-10
+#: Where nothing is free to move, what is held back is lost: this little is rounding.
+ROUNDING_DAMPING = 1e-15
 
 
 class Damping(Protocol):
@@ -47,12 +50,13 @@ class Damping(Protocol):
 class NielsenDamping:
     """The damping of Levenberg-Marquardt."""
 
-    def __init__(self, value: float) -> None:
+    def __init__(self, value: float, lowest: float = MIN_DAMPING) -> None:
         self.value = value
+        self._lowest = lowest
         self._growth = 2.0
 
     def lowered(self, gain_ratio: float) -> float:  # noqa: D102
-        return max(self.value * max(1.0 / 3.0, 1.0 - (2.0 * gain_ratio - 1.0) ** 3), MIN_DAMPING)
+        return max(self.value * max(1.0 / 3.0, 1.0 - (2.0 * gain_ratio - 1.0) ** 3), self._lowest)
 
     def accept(self, gain_ratio: float) -> None:  # noqa: D102
         self.value, self._growth = self.lowered(gain_ratio), 2.0
@@ -77,9 +81,20 @@ class NoDamping:
         return Termination.STEP_REFUSED if trial.has_step else Termination.SINGULAR
 
 
-def damping_from(first: float) -> Damping:
-    """Return the damping that begins with a value; none at all where that is zero."""
-    return NielsenDamping(first) if first > 0.0 else NoDamping()
+def damping_from(first: float, variables: Mapping[str, Variables]) -> Damping:
+    """Return the damping of a problem that begins with a value; none at all where that is zero.
+
+    Poses of a long chain have directions that its motions determine ten orders of magnitude less than single poses:
+    steps along these end only where the damping is lower still. It may be, where some pose is held.
+    """
+    if first <= 0.0:
+        return NoDamping()
+    graph = all(group.manifold.kind == "pose" for group in variables.values())
+    held = any(
+        free is not None and not free.any(axis=1).all()
+        for free in (group.free_coordinates() for group in variables.values())
+    )
+    return NielsenDamping(first, ROUNDING_DAMPING if graph and held else MIN_DAMPING)
 
 
 def predicted_decrease(

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import InitVar, dataclass
+from dataclasses import dataclass
 
 from groma.errors import InputError, did_you_mean
 from groma.gates import gate
@@ -51,15 +51,7 @@ class SolverOptions:
     #: Threads; None takes one for small problems and all cores for large ones.
     threads: int | None = None
 
-    #: Gone: see ``method``.
-    strategy: InitVar[str | None] = None
-
-    def __post_init__(self, strategy: str | None) -> None:
-        if strategy is not None:
-            raise InputError(
-                f"There is no strategy any more (got {strategy!r}): steps are damped as method='levenberg_marquardt' "
-                "says, or not at all, method='gauss_newton'."
-            )
+    def __post_init__(self) -> None:
         choices = {"method": METHODS, "linear_solver": linear_solver_names(), "shared_system": SHARED_SYSTEMS}
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:

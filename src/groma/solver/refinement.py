@@ -48,7 +48,7 @@ class LandmarkRefiner:
             unmoved = {**inner, **{group: before[group] for group in groups}}
             for e, (group, kept_costs) in enumerate(zip(groups, self._blocks.costs(unmoved), strict=True)):
                 better = kept_costs < costs[e]
-                inner[group] = np.where(better[:, None], before[group], inner[group])
+                inner = {**inner, group: np.where(better[:, None], before[group], inner[group])}
                 costs[e] = np.where(better, kept_costs, costs[e])
         for _ in range(self._steps):
             inner, costs, _ = self._blocks.step(inner, costs)

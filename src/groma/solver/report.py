@@ -126,6 +126,8 @@ def count_unknowns(problem: Problem) -> int:
     used = {ref.group for factor in problem.factors if len(factor) for _, ref in factor.references()}
     for name in used:
         group = problem.variables[name]
+        if group.is_constant:
+            continue
         free = group.free_coordinates()
         total += len(group) * group.manifold.dof if free is None else int(free.sum())
     return total

@@ -42,8 +42,6 @@ class TrackOptions:
     window: int = 7
     #: Look for places seen before, and close loops.
     close_loops: bool = True
-    #: Adjust all keyframes together at the end.
-    adjust_at_end: bool = True
     #: Use relations between landmarks that the data support: lines on planes, parallel and perpendicular planes.
     relations: bool = True
     #: Work in several threads; the result is the same. A keyframe (not before 45 ms by the time stamps) and the

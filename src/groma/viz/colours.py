@@ -3,16 +3,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
+from groma.scene import Scene
 from groma.scene.patches import PALETTE
-
-if TYPE_CHECKING:
-    from groma.scene import Scene
 
 Colours = npt.NDArray[np.uint8]
 

@@ -12,20 +12,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
+from groma.cameras import CameraModel
 from groma.geometry import se3
 from groma.geometry.incidence import closest_points
 from groma.geometry.line3 import from_point_and_direction
+from groma.scene import Scene
 from groma.scene.patches import plane_patches
-
-if TYPE_CHECKING:
-    from groma.cameras import CameraModel
-    from groma.scene import Scene
 
 #: Step along the image of a line that gives its direction, radians.
 _STEP = 1e-4

@@ -13,15 +13,12 @@ extreme places on either side, in closed form.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray
 from groma.scene.upright import upward
-
-if TYPE_CHECKING:
-    from groma.viz.drawable import Drawable
+from groma.viz.drawable import Drawable
 
 #: Share of the points, of the lines and of the cameras that count; the rest is farther from the middle than these.
 LANDMARK_SHARE, CAMERA_SHARE = 0.95, 0.98

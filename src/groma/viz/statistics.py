@@ -4,18 +4,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.scene import Scene
 from groma.scene.line_intervals import supported_lengths
-from groma.viz.drawable import drawable, rms_by_group
-
-if TYPE_CHECKING:
-    from groma.scene import Scene
-    from groma.scene.line_intervals import supported_lengths
-from groma.viz.drawable import Drawable
+from groma.viz.drawable import Drawable, drawable, rms_by_group
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from groma.adjustment.adjust import COUNTED_OTHERWISE
-from groma.adjustment.assemble import AssemblyOptions
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.parts.checkpoint import FOLDER, Checkpoint, key_of
 from groma.adjustment.parts.cut import parts_of
 from groma.adjustment.parts.memory import room_for_parts
@@ -84,7 +84,7 @@ def adjust_parts(
         The processes that adjust the parts together, such as :class:`groma.solver.reduce.mpi.Ranks`; each of them calls
         this function with the same arguments. Default: this process alone.
     **assembly
-        Fields of :class:`groma.adjustment.assemble.AssemblyOptions`, such as ``refine_intrinsics``.
+        Fields of :class:`groma.adjustment.assembly_options.AssemblyOptions`, such as ``refine_intrinsics``.
 
     Returns
     -------

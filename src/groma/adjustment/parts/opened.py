@@ -18,7 +18,6 @@ import numpy as np
 from groma._typing import IntArray
 from groma.adjustment.assemble import (
     Assembly,
-    AssemblyOptions,
     assemble,
     camera_variables,
     first_camera_gauge,
@@ -26,6 +25,7 @@ from groma.adjustment.assemble import (
     observations_of_frames,
     structure_variables,
 )
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.parts.same import check_same_scene
 from groma.adjustment.parts.together import agreed, exchange
 from groma.adjustment.pixel_residuals import squared_residuals_px

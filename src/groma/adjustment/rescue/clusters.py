@@ -15,8 +15,9 @@ from dataclasses import replace
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.adjustment.assemble import LINE_FACTORS, POINT_FACTORS
+from groma.adjustment.assemble import POINT_FACTORS
 from groma.adjustment.rescue.restart import GATES, triangulated_anew, went_elsewhere, with_cameras
+from groma.adjustment.terms.lines import LINE_FACTORS
 from groma.factors.contract import Factor, Ref
 from groma.problem.problem import Problem
 from groma.problem.residuals import squared_norms

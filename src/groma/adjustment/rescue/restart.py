@@ -21,7 +21,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.adjustment.assemble import LINE_FACTORS, disassemble
+from groma.adjustment.assemble import disassemble
+from groma.adjustment.terms.lines import LINE_FACTORS
 from groma.cameras import model as camera_model
 from groma.estimators.line_ends import SegmentRays, trim
 from groma.estimators.line_triangulation import triangulate_planes

@@ -34,7 +34,8 @@ import numpy as np
 import scipy  # its parts are imported when something of them is first used
 
 from groma._typing import FloatArray, IntArray
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.places import at_places_of
 from groma.adjustment.survey.place import moved, weighted
 from groma.adjustment.survey.records import (

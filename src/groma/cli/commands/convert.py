@@ -68,7 +68,8 @@ def _convert(source: Path, target: Path, console: Console, force: bool) -> dict[
         scene = scene.points_only().keep(point_observations=[])
     geometry = target.suffix.lower() in (".ply", ".obj", ".dxf")
     console.wrote(f"{target}: {sentence_of(scene, geometry=geometry)}")
-    warnings = [] if geometry else [*_missing_images(source, scene), *_unknown_sizes(scene, target)]
+    warnings = [*_missing_images(source, scene), *_unknown_sizes(scene, target), *_unseen_points(source, scene, target)]
+    warnings = [] if geometry else warnings
     for sentence in warnings:
         console.warn(sentence)
     return {**counts_of(scene), "warnings": warnings}
@@ -101,6 +102,18 @@ def _unknown_sizes(scene: "Scene", target: Path) -> list[str]:
     return [
         f"The images of {counted(unknown, 'cameras')} have no known size: the model says 0 x 0 pixels, counted from "
         "the image centre. groma adjust takes it; for anything else put the photographs beside the input, and repeat."
+    ]
+
+
+def _unseen_points(source: Path, scene: "Scene", target: Path) -> list[str]:
+    """Say that no image sees any of the points, where the target has a place for that."""
+    if not scene.num_points or len(scene.point_observations) or target.suffix.lower() == ".json":
+        return []
+    is_opensfm = source.stem.startswith("reconstruction") or (source / "reconstruction.json").is_file()
+    tracks = " OpenSfM keeps that in tracks.csv: put it beside the input, and repeat." if is_opensfm else ""
+    return [
+        f"{source} does not say which images see its {scene.num_points:,} points: they are written without "
+        f"observations, and groma adjust and groma map --model need these.{tracks}"
     ]
 
 

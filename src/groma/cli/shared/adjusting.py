@@ -68,7 +68,7 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
     if wanted.output is not None:
         check_target(before, wanted.output)
     true = None if wanted.truth is None else read_scene(wanted.truth)
-    console.expect_compilation("adjust")
+    console.expect_compilation(_work_of(before, options))
     with compilation_time() as compilation, console.progress() as progress:
         before, result, survey, motions = _adjusted(before, options, wanted, progress)
     entries = ()
@@ -116,6 +116,18 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
     _output.write_json(wanted.json_target, numbers, wanted.force)
     if failure is not None:
         raise failure
+
+
+def _work_of(scene: Scene, options: AdjustOptions) -> str:
+    """Return the list of compiled functions that an adjustment is likely to need."""
+    from groma.compilation.needed import adjusting
+
+    models = scene.cameras.models if options.camera_model is None else (options.camera_model,)
+    estimated = options.refine_intrinsics
+    if estimated is None:
+        estimated = options.camera_model is not None or "BAL" in models
+    has_points_alone = not (scene.num_lines or scene.num_planes or any(scene.num_measurements.values()))
+    return adjusting(models, estimated, has_points_alone)
 
 
 def _write_page(

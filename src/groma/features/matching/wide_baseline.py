@@ -365,14 +365,3 @@ def _evidence(features: FloatArray) -> FloatArray:
     points = w.points_for * np.log1p(for_it) - w.points_against * np.log1p(against)
     points -= w.points_missing * np.log1p(missing)
     return w.bias - w.descriptor * distance + points + w.overlap * overlap
-
-
-__all__ = [
-    "FEATURES",
-    "EvidenceGates",
-    "LineMatches",
-    "WideBaselineOptions",
-    "candidates",
-    "fundamental_from_poses",
-    "match_wide_baseline",
-]

@@ -38,6 +38,8 @@ from groma.scene import Scene
 _ROOM, _IMAGE_ROOM, _PAIR_ROOM = 8 << 20, 4 << 20, 1 << 18
 #: Matches per image from which overlap and texture are not what is missing (convention: a word in a message).
 FEW_MATCHES = 100
+#: Images that a model needs.
+_LEAST_IMAGES = 3
 
 Progress = Callable[[str, int, int], None]
 
@@ -160,10 +162,11 @@ def reconstruct_points(
     if not models:
         with _opened(pycolmap, database) as content:
             features, matches = content.num_keypoints(), content.num_inlier_matches()
+            linked = _most_linked(pycolmap, content)
         raise InputError(
             f"No reconstruction came out of the {counted(len(names), 'images')} in {images}: {features:,} points "
             f"were found in them and {matches:,} matches between them. "
-            f"{_why_none(features, matches, len(names))} "
+            f"{_why_none(features, matches, len(names), linked)} "
             "Take more images with more overlap, from places some steps apart, or pass a model with --model."
         )
     # Of equally many images the one with more points, so that the choice does not depend on an order.
@@ -171,12 +174,29 @@ def reconstruct_points(
     return from_pycolmap(best)
 
 
-def _why_none(features: int, matches: int, count: int) -> str:
+def _most_linked(pycolmap: Any, content: Any) -> int:
+    """Return how many images the largest group holds that pairs of many matches link."""
+    pairs, matches = content.read_two_view_geometry_num_inliers()
+    group = {image.image_id: {image.image_id} for image in content.read_all_images()}
+    for pair, shared in zip(pairs, matches, strict=True):
+        one, other = (group[number] for number in pycolmap.pair_id_to_image_pair(pair))
+        if shared >= FEW_MATCHES and one is not other:
+            one |= other
+            group.update(dict.fromkeys(other, one))
+    return max(map(len, group.values()), default=0)
+
+
+def _why_none(features: int, matches: int, count: int, linked: int) -> str:
     """Say why nothing could be reconstructed."""
     if features == 0:
         return "They show no texture."
     if matches < FEW_MATCHES * count:
         return "They overlap too little, or show too little texture."
+    if linked < _LEAST_IMAGES:
+        return (
+            f"No {_LEAST_IMAGES} of them are linked by pairs with {FEW_MATCHES} matches and more: they overlap too "
+            "little, or were taken from too different directions."
+        )
     return "They match, but no two show depth: the camera only turned, or moved too little for its distance."
 
 

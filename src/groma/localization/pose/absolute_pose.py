@@ -16,12 +16,13 @@ import numpy.typing as npt
 from groma._typing import BoolArray, FloatArray
 from groma.geometry import quaternion
 from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.free_lens import FreeLens, free_lens
 from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import max_errors, propose, straightened
 from groma.localization.pose.lens import lens_step
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pieces import cells_elsewhere
-from groma.localization.pose.refinement import LensUnknowns, Refined, cells_of, fitted, refine
+from groma.localization.pose.refinement import Refined, cells_of, fitted, refine
 from groma.localization.pose.verdict import (
     Evidence,
     Status,
@@ -56,10 +57,9 @@ class PoseOptions:
     #: Focal lengths that are tried, over that of the camera: :data:`UNKNOWN_LENS` where nothing is known of it.
     focal_factors: tuple[float, ...] = (1.0,)
 
-    @property
-    def lens(self) -> LensUnknowns:
-        """What is estimated of the lens."""
-        return "all" if self.refine_lens else "none"
+    def lens_of(self, camera: QueryCamera) -> FreeLens | None:
+        """What is estimated of the lens of a camera."""
+        return free_lens(camera, "all" if self.refine_lens else "none")
 
 
 #: Of so many points of a mirror image one is matched first (cost: fewer tell too little where a place repeats).
@@ -225,10 +225,10 @@ def pose_from_matches(
     rival_of = (best, first) if options.look_for_rival and first.significant else None
     used = matches
     if guided is not None and first.significant:
-        used = guided(best)
+        used, lens = guided(best), options.lens_of(camera)
         errors = _errors(used, options)
-        best = refine(best.camera, used, best.pose, errors, options.lens, gathered=True)
-        own = fitted(best.camera, matches, best.pose, errors, options.lens)
+        best = refine(best.camera, used, best.pose, errors, lens, gathered=True)
+        own = fitted(best.camera, matches, best.pose, errors, lens)
         first = evidence_of(own, matches, places)
     if first.agree < enough:
         return _failed(camera, matches)
@@ -320,7 +320,7 @@ def _best(
     errors = _errors(matches, options)
     starts = [_with_focal_length(camera, factor) for factor in options.focal_factors]
     found = [(propose(straightened(one, matches), errors, options.seed, share, least), one) for one in starts]
-    refined = [refine(one, matches, pose, errors, options.lens) for pose, one in found if pose is not None]
+    refined = [refine(one, matches, pose, errors, options.lens_of(camera)) for pose, one in found if pose is not None]
     return max(refined, key=lambda one: int(one.point_inliers.sum() + one.line_inliers.sum()), default=None)
 
 

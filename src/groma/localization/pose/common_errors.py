@@ -26,12 +26,12 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from groma._numba import loop
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.stages import STAGES, with_loss
 from groma.errors import ProblemError
-from groma.factors.contract import Factor
 from groma.factors.losses import GemanMcClure
 from groma.gates import gate
 from groma.localization.pose.matches import Matches
@@ -55,6 +55,31 @@ class CommonErrorGates:
 GATES = CommonErrorGates()
 
 
+# ---------------------------------------------------------------------------------------------------------- Kernels
+@loop
+def _pull_views(begin, seen, motion, landmarks, by_landmark, first_camera, K):
+    """Add to K what landmarks (n,) do that pull (n, d, m) at a query, view by view of the map."""
+    parameters, size = motion.shape[2] - 6, motion.shape[1]
+    moved = np.empty(motion.shape[2])
+    for n in range(landmarks.shape[0]):
+        if landmarks[n] >= begin.shape[0] - 1:
+            continue
+        for row in range(begin[landmarks[n]], begin[landmarks[n] + 1]):
+            frame, camera = 6 * seen[row, 1], first_camera + parameters * seen[row, 2]
+            for i in range(by_landmark.shape[1]):
+                for j in range(motion.shape[2]):
+                    moved[j] = 0.0
+                for k in range(size):
+                    factor = by_landmark[n, i, k]
+                    for j in range(motion.shape[2]):
+                        moved[j] += factor * motion[row, k, j]
+                for j in range(6):
+                    K[frame + j, i] += moved[j]
+                for j in range(parameters):
+                    K[camera + j, i] += moved[6 + j]
+
+
+# ----------------------------------------------------------------------------------------------------------- Public
 @dataclass(frozen=True, eq=False)
 class Responses:
     """How landmarks follow errors of poses and calibrations, one row an observation, in the order of the landmarks."""
@@ -69,14 +94,6 @@ class Responses:
     def begin(self) -> IntArray:
         """Where the rows of each landmark begin, and end."""
         return np.concatenate([[0], np.cumsum(np.bincount(self.seen[:, 0], minlength=1))]).astype(np.int64)
-
-    def of(self, landmarks: IntArray) -> tuple[IntArray, IntArray]:
-        """Return rows of some landmarks, and for each the place of its landmark among them."""
-        known = np.minimum(landmarks, len(self.begin) - 2)
-        count = np.where(known == landmarks, self.begin[known + 1] - self.begin[known], 0)
-        place = np.repeat(np.arange(len(landmarks)), count)
-        within = np.arange(len(place)) - np.repeat(np.cumsum(count) - count, count)
-        return np.repeat(self.begin[known], count) + within, place
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,41 +131,22 @@ class CommonErrors:
         weight = (1.0 + (r**2).sum(axis=1) / last_scale(len(r)) ** 2) ** -2
         pull = weight[:, None, None] * np.swapaxes(J, 1, 2)
         some = matches.take(*kept)
-        problem = problem_of(refined.camera, some, refined.pose, J.shape[2] > 6)
+        one = problem_of(refined.camera, some, refined.pose, refined.lens is not None)
         K = np.zeros((len(self.covariance), J.shape[2]))
-        for factor, white in zip(problem.factors, landmark_weights(problem, some), strict=True):
-            for kind, own, begin in (("points", self.points, 0), ("lines", self.lines, some.num_points)):
-                at = landmark_rows(factor, kind)
-                if at is None:
-                    continue
-                row = int(kind == "lines")
-                wanted = {kind[:-1]: own.motion.shape[1]}
-                by_landmark = pull[begin + at] @ white @ records(problem, factor, wanted)[..., :-1]
-                self._add(K, own, landmarks[row][kept[row]][at], by_landmark)
-                if camera is not None and self.parameters and _has(factor, "intrinsics"):
-                    first = 6 * self.frames + camera * self.parameters
-                    by_lens = white @ records(problem, factor, {"intrinsics": len(refined.camera.params)})[..., :-1]
-                    K[first : first + by_lens.shape[2]] += np.einsum("nik,nkj->ji", pull[begin + at], by_lens)
-        H = np.einsum("nik,nkj->ij", pull, J)
+        for part, white in zip(one.parts, landmark_weights(one, some), strict=True):
+            lines = part.kind == "lines"
+            own, row = (self.lines if lines else self.points), part.row + lines * some.num_points
+            wanted = {part.kind[:-1]: own.motion.shape[1], "intrinsics": len(one.params)}
+            by_own, by_lens = np.split(white @ one.records(part, wanted)[..., :-1], [own.motion.shape[1]], axis=2)
+            seen = landmarks[int(lines)][kept[int(lines)]][part.row]
+            _pull_views(own.begin, own.seen, own.motion, seen, pull[row] @ by_own, 6 * self.frames, K)
+            if camera is not None and self.parameters and part.has_lens:
+                first = 6 * self.frames + camera * self.parameters
+                K[first : first + by_lens.shape[2]] += np.einsum("nik,nkj->ji", pull[row], by_lens)
+        H = np.einsum("nik,nkj->ij", pull, J) + refined.prior
         scale = 1.0 / np.sqrt(np.diag(H))
         step = (K * scale) @ np.linalg.inv(H * np.outer(scale, scale)) * scale
         return (step.T @ self.covariance @ step)[:6, :6]
-
-    def _add(self, K: FloatArray, own: Responses, landmarks: IntArray, by_landmark: FloatArray) -> None:
-        """Add to K what landmarks (n,) do that pull (n, d, m) at a query, view by view of the map."""
-        rows, place = own.of(landmarks)
-        if not len(rows):
-            return
-        cameras = int(own.seen[:, 2].max()) + 1
-        view = own.seen[rows, 1] * cameras + own.seen[rows, 2]
-        order = np.argsort(view, kind="stable")
-        first = np.flatnonzero(np.diff(view[order], prepend=-1))
-        moved = by_landmark[place[order]] @ own.motion[rows[order]]
-        for total, number in zip(np.add.reduceat(moved, first), view[order][first].tolist(), strict=True):
-            frame, camera = divmod(number, cameras)
-            K[6 * frame : 6 * frame + 6] += total[:, :6].T
-            begin = 6 * self.frames + camera * self.parameters
-            K[begin : begin + self.parameters] += total[:, 6:].T
 
 
 def common_errors(
@@ -225,10 +223,6 @@ def _padded(covariance: FloatArray, scene: Scene, count: int) -> FloatArray:
     out = np.zeros((first + count * len(sizes),) * 2)
     out[np.ix_(into, into)] = covariance
     return out
-
-
-def _has(factor: Factor, name: str) -> bool:
-    return any(slot.name == name for slot, _ in factor.references())
 
 
 def _responses(scene: Scene, kind: str, parameters: int, gates: CommonErrorGates = GATES) -> Responses:

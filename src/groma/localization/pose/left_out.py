@@ -19,7 +19,7 @@ from groma._typing import BoolArray, FloatArray
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pose_problem import problem_of
-from groma.localization.pose.records import landmark_rows, motions_of_lines, records, times
+from groma.localization.pose.records import motions_of_lines
 
 #: A landmark whose information falls below this share in some direction hung on the image that was left out.
 _LEFT = 1e-2
@@ -39,24 +39,20 @@ def without_image(camera: QueryCamera, matches: Matches, pose: FloatArray) -> Ma
     Matches
         Without those of landmarks that the other images do not determine.
     """
-    problem = problem_of(camera, matches, pose)
+    one = problem_of(camera, matches, pose)
     points3d, point_covariance = matches.points3d.copy(), matches.point_covariance.copy()
     segments3d, line_covariance = matches.segments3d.copy(), matches.line_covariance.copy()
     good, good_lines = np.zeros(matches.num_points, bool), np.zeros(matches.num_lines, bool)
-    for factor in problem.factors:
-        for name, size in (("points", 3), ("lines", 6)):
-            rows = landmark_rows(factor, name)
-            if rows is None:
-                continue
-            white = times(factor.sqrt_information, records(problem, factor, {name[:-1]: size}))
-            if name == "points":
-                step, covariance, kept = _downdated(white, point_covariance[rows], np.eye(3)[None])
-                points3d[rows], point_covariance[rows], good[rows] = points3d[rows] + step, covariance, kept
-            else:
-                plucker = problem.variables["lines"].ambient()[rows]
-                step, covariance, kept = _downdated(white, line_covariance[rows], motions_of_lines(plucker))
-                segments3d[rows] = _moved(plucker + step, segments3d[rows])
-                line_covariance[rows], good_lines[rows] = covariance, kept
+    for part in one.parts:
+        rows, landmarks = part.row, part.landmarks[part.row]
+        white = one.whitened(part, {part.kind[:-1]: landmarks.shape[1]})
+        if part.kind == "points":
+            step, covariance, kept = _downdated(white, point_covariance[rows], np.eye(3)[None])
+            points3d[rows], point_covariance[rows], good[rows] = points3d[rows] + step, covariance, kept
+        else:
+            step, covariance, kept = _downdated(white, line_covariance[rows], motions_of_lines(landmarks))
+            segments3d[rows] = _moved(landmarks + step, segments3d[rows])
+            line_covariance[rows], good_lines[rows] = covariance, kept
     moved = replace(
         matches, points3d=points3d, point_covariance=point_covariance, segments3d=segments3d,
         line_covariance=line_covariance,

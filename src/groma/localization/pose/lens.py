@@ -16,6 +16,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.gates import gate
+from groma.localization.pose.free_lens import free_lens
 from groma.localization.pose.gates import VERDICT, VerdictGates
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.refinement import Refined, fitted, refine
@@ -60,13 +61,13 @@ def lens_step(
         What far means.
     """
     some = _evenly(matches, GATES.matches)
-    found = refine(refined.camera, some, refined.pose, max_error, "focal", gathered=True)
+    found = refine(refined.camera, some, refined.pose, max_error, free_lens(refined.camera, "focal"), gathered=True)
     focal, covariance = _step(refined, found, some)
     told = LensStep(float(focal[0]), float(np.sqrt(covariance[0, 0])))
-    points = refined.camera.kind.principal_point_indices
-    if not points or not _may_be_far(fitted(found.camera, some, found.pose, max_error, "pinhole"), 0.5 * gates.shift):
+    points, whole = refined.camera.kind.principal_point_indices, free_lens(refined.camera, "pinhole")
+    if not points or not _may_be_far(fitted(found.camera, some, found.pose, max_error, whole), 0.5 * gates.shift):
         return told
-    found = refine(refined.camera, some, refined.pose, max_error, "pinhole", gathered=True)
+    found = refine(refined.camera, some, refined.pose, max_error, whole, gathered=True)
     step, covariance = _step(refined, found, some)
     if not np.isfinite(covariance).all():
         return told

@@ -13,7 +13,7 @@ from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.one_image import one_image_problem
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.matches import Matches
-from groma.problem.problem import Problem
+from groma.localization.pose.one_pose import OnePose
 from groma.scene import LineObservations, Lines, PointObservations, Points, Scene
 
 _ASSEMBLY = AssemblyOptions(
@@ -21,14 +21,15 @@ _ASSEMBLY = AssemblyOptions(
 )
 
 
-def problem_of(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_lens: bool = False) -> Problem:
+def problem_of(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_lens: bool = False) -> OnePose:
     """The problem of one pose, with the noise of the image alone."""
     lines = Lines.through(matches.segments3d)
-    if not refine_lens and (camera.kind.has_pinhole_parameters or not matches.num_lines):
-        return one_image_problem(
+    if camera.kind.has_pinhole_parameters or not matches.num_lines:
+        problem = one_image_problem(
             (camera.kind, camera.params), pose, (matches.points2d, matches.points3d, matches.point_sigma),
             (matches.segments2d.reshape(-1, 4), lines.plucker, matches.segment_sigma),
         )  # fmt: skip
+        return OnePose.of(problem, camera.params)
     image = np.zeros(matches.num_points, np.int64), np.zeros(matches.num_lines, np.int64)
     scene = Scene.from_images(
         camera.table(), ["query"], [0], pose[None],
@@ -41,4 +42,4 @@ def problem_of(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_l
             image[1], np.arange(matches.num_lines), matches.segments2d.reshape(-1, 4), matches.segment_sigma
         ),
     )  # fmt: skip
-    return assemble(scene, replace(_ASSEMBLY, refine_intrinsics=refine_lens)).problem
+    return OnePose.of(assemble(scene, replace(_ASSEMBLY, refine_intrinsics=refine_lens)).problem, camera.params)

@@ -30,33 +30,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
 
 import numpy as np
 
 from groma._numba import loop
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.adjustment.stages import with_loss
-from groma.factors.contract import Factor
 from groma.factors.losses import Cauchy, GemanMcClure
 from groma.gates import chi_square_gate
 from groma.geometry import se3
 from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.free_lens import FreeLens
 from groma.localization.pose.gates import REFINEMENT, RefinementGates
 from groma.localization.pose.matches import Matches, nearest_claims
-from groma.localization.pose.pose_fit import FINELY, ROUGHLY, fit_pose, free_lens
+from groma.localization.pose.one_pose import OnePose, Part
+from groma.localization.pose.pose_fit import FINELY, ROUGHLY, fit_pose
 from groma.localization.pose.pose_problem import problem_of
-from groma.localization.pose.records import landmark_rows, records, times
-from groma.localization.pose.residuals import Residuals, residual_squares_of, residuals, weighted_near
-from groma.problem.problem import Problem
-from groma.solver.options import SolverOptions
-from groma.solver.solve import solve
+from groma.localization.pose.records import times
+from groma.localization.pose.residuals import Residuals, residual_squares_of, residuals
 
 #: Information of scaled unknowns below which they are not determined.
 _SINGULAR = 1e-10
-_LENS = SolverOptions(max_iterations=30, function_tolerance=1e-6, threads=1)
-#: What is estimated of the lens.
-LensUnknowns = Literal["none", "focal", "pinhole", "all"]
 
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
@@ -100,6 +93,13 @@ class Refined:
     #: Noise that the residuals show, in units of what was stated, and the squared residual that agrees.
     sigma0: float
     limit: float
+    #: What is estimated of the lens.
+    lens: FreeLens | None = None
+
+    @property
+    def prior(self) -> FloatArray:
+        """(6 + k, 6 + k) what is known of the lens before: information."""
+        return np.zeros((6, 6)) if self.lens is None else self.lens.prior(self.camera.params)[:-1, :-1]
 
     def covariance(self, matches: Matches, gates: RefinementGates = REFINEMENT) -> FloatArray:
         """(6, 6) covariance of the left twist; infinite where the matches do not determine the pose."""
@@ -119,6 +119,7 @@ class Refined:
         cell = self._cells(matches, gates)
         J /= float(self.camera.kind.focal_length(self.camera.params))
         information = np.einsum("n,nki,nkj->ij", 1.0 / np.bincount(cell)[cell], J, J)
+        information += self.prior * matches.shared_error**2
         scale = 1.0 / np.sqrt(np.diag(information))
         return np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
 
@@ -135,15 +136,18 @@ class Refined:
         scale = np.sqrt((J**2).sum(axis=(0, 1)))
         if not (scale > 0.0).all():
             return np.full((J.shape[2], J.shape[2]), np.inf)
-        values, vectors = np.linalg.eigh(np.einsum("nki,nkj->ij", J / scale, J / scale))
+        pull, sigma = _pull(r, J.shape[2], gates)
+        white = (J / scale).reshape(-1, len(scale))
+        values, vectors = np.linalg.eigh(white.T @ white + sigma**2 * self.prior / np.outer(scale, scale))
         if not values[0] > _SINGULAR:
             return np.full((J.shape[2], J.shape[2]), np.inf)
-        pull, sigma = _pull(r, J.shape[2], gates)
         root = sigma * vectors / np.sqrt(values) / scale[:, None]
         cell = self._cells(matches, gates)
         count, dof = int(cell.max()) + 1, len(scale)
         gradient = np.zeros((count, dof))
-        np.add.at(gradient, cell, np.einsum("nki,nk->ni", J @ (root / sigma), pull / sigma))
+        pulled = np.einsum("nki,nk->ni", J @ (root / sigma), pull / sigma)
+        for k in range(dof):
+            gradient[:, k] = np.bincount(cell, pulled[:, k], count)
         if count > dof:
             shared, axes = np.linalg.eigh(gradient.T @ gradient * (count / (count - dof)))
             by_chance = (1.0 + np.sqrt(dof / count)) ** 2  # the largest such eigenvalue of independent errors
@@ -201,7 +205,7 @@ def refine(
     matches: Matches,
     start: FloatArray,
     max_error: tuple[float, float],
-    lens: LensUnknowns = "none",
+    lens: FreeLens | None = None,
     gathered: bool = False,
     gates: RefinementGates = REFINEMENT,
 ) -> Refined:
@@ -216,40 +220,33 @@ def refine(
     max_error
         Matches of points and lines further from where a pose puts them, pixels, say nothing about pose and noise.
     lens
-        Estimate the focal length (several by one factor), that and the principal point, or focal length and
-        distortion, too.
+        What is estimated of the camera, too.
     gathered
         The matches were looked for near the start, as far as it may be off: all of them are near at first.
     gates
         Numbers of the fit.
     """
-    problem = problem_of(camera, matches, start, lens == "all")
+    one = problem_of(camera, matches, start, lens is not None)
     limits = [
         (error / sigma) ** 2
         for error, sigma in zip(max_error, (matches.point_sigma, matches.segment_sigma), strict=True)
     ]
     near: tuple[BoolArray, BoolArray] | None = None
     for round_ in range(gates.rounds + 1):
-        weights = landmark_weights(problem, matches)
-        squares = residual_squares_of(problem, weights, matches)
+        weights = landmark_weights(one, matches)
+        squares = residual_squares_of(one, weights, matches)
         wide = gathered and round_ == 0
         before, near = near, (wide | (squares[0] <= limits[0]), wide | (squares[1] <= limits[1]))
         last = round_ == gates.rounds or (before is not None and all(map(np.array_equal, near, before)))
         loss = GemanMcClure(last_scale(_agreeing(squares, gates), gates)) if last else Cauchy(gates.wide_loss)
-        if lens == "all":
-            solved = solve(with_loss(weighted_near(problem, weights, near), loss), _LENS).problem
-            states = {name: group.state for name, group in solved.variables.items()}
-        else:
-            free = free_lens(camera.kind, lens == "pinhole") if lens != "none" else None
-            states = fit_pose(problem, weights, near, loss, FINELY if last else ROUGHLY, free)
-        moved = problem.with_states(states)
-        estimated = camera if lens == "none" else _camera_of(moved, camera)
+        moved = fit_pose(one, weights, near, loss, FINELY if last else ROUGHLY, lens)
+        estimated = camera if lens is None else _camera_of(moved, camera)
         if estimated is None:
             break
-        camera, problem = estimated, moved
+        camera, one = estimated, moved
         if last:
             break
-    return _fitted(problem, camera, matches, max_error, lens, gates)
+    return _fitted(one, camera, matches, max_error, lens, gates)
 
 
 def _agreeing(squares: tuple[FloatArray, FloatArray], gates: RefinementGates) -> int:
@@ -269,33 +266,33 @@ def fitted(
     matches: Matches,
     pose: FloatArray,
     max_error: tuple[float, float],
-    lens: LensUnknowns = "none",
+    lens: FreeLens | None = None,
     gates: RefinementGates = REFINEMENT,
 ) -> Refined:
     """Say which matches agree with a pose as it is; parameters as of :func:`refine`."""
-    return _fitted(problem_of(camera, matches, pose, False), camera, matches, max_error, lens, gates)
+    return _fitted(problem_of(camera, matches, pose, lens is not None), camera, matches, max_error, lens, gates)
 
 
 def _fitted(
-    problem: Problem,
+    one: OnePose,
     camera: QueryCamera,
     matches: Matches,
     max_error: tuple[float, float],
-    lens: LensUnknowns,
+    lens: FreeLens | None,
     gates: RefinementGates,
 ) -> Refined:
-    pose, weights = problem.variables["frames"].state[0], landmark_weights(problem, matches)
-    directions = _lens_directions(camera, lens)
-    points = residuals(problem, weights, "points", matches.num_points, directions)
-    lines = residuals(problem, weights, "lines", matches.num_lines, directions)
+    weights = landmark_weights(one, matches)
+    directions = None if lens is None else lens.directions(one.params)
+    points = residuals(one, weights, "points", matches.num_points, directions)
+    lines = residuals(one, weights, "lines", matches.num_lines, directions)
     sigma0 = _noise((points, lines), matches, max_error, gates)
     limit = chi_square_gate(gates.outlier, 2) * sigma0**2
-    near = (points.square <= limit, (lines.square <= limit) & _in_front(camera, matches, pose))
+    near = (points.square <= limit, (lines.square <= limit) & _in_front(camera, matches, one.pose))
     agree = [
         nearest_claims(claim, found.square, inside)
         for claim, found, inside in zip(matches.claims(), (points, lines), near, strict=True)
     ]
-    return Refined(pose, camera, points, lines, agree[0], agree[1], sigma0, limit)
+    return Refined(one.pose, camera, points, lines, agree[0], agree[1], sigma0, limit, lens)
 
 
 def _in_front(camera: QueryCamera, matches: Matches, pose: FloatArray) -> BoolArray:
@@ -315,33 +312,22 @@ def _in_front(camera: QueryCamera, matches: Matches, pose: FloatArray) -> BoolAr
     return np.einsum("ni,ni->n", start, ray) * square > np.einsum("ni,ni->n", start, way) * along
 
 
-def _lens_directions(camera: QueryCamera, lens: LensUnknowns) -> FloatArray | None:
-    """Directions (p, k) in which parameters of a camera are estimated."""
-    if lens == "none":
-        return None
-    if lens != "all":
-        return free_lens(camera.kind, lens == "pinhole").directions(camera.params)
-    return np.eye(len(camera.params))[:, sorted((*camera.kind.focal_indices, *camera.kind.extra_indices))]
-
-
-def landmark_weights(problem: Problem, matches: Matches) -> list[FloatArray]:
+def landmark_weights(one: OnePose, matches: Matches) -> list[FloatArray]:
     """Inverse noise (n, 2, 2) of the factors of a problem that holds that of their landmarks, too, as they are seen
     from where its pose is.
     """
     covariances = {"points": matches.point_covariance, "lines": matches.line_covariance}
-    return [_widened(problem, factor, covariances) for factor in problem.factors]
+    return [_widened(one, part, covariances[part.kind]) for part in one.parts]
 
 
-def _widened(problem: Problem, factor: Factor, covariances: dict[str, FloatArray]) -> FloatArray:
-    image = np.broadcast_to(times(factor.sqrt_information, np.eye(2)[None]), (len(factor), 2, 2))
-    for name, covariance in covariances.items():
-        rows = landmark_rows(factor, name)
-        if rows is not None and covariance.any():
-            J = records(problem, factor, {name[:-1]: covariance.shape[1]})
-            sqrt_information = np.empty((len(factor), 2, 2))
-            _widen(image, J, covariance, rows, sqrt_information)
-            return sqrt_information
-    return np.ascontiguousarray(image)
+def _widened(one: OnePose, part: Part, covariance: FloatArray) -> FloatArray:
+    image = np.broadcast_to(times(part.factor.sqrt_information, np.eye(2)[None]), (len(part.row), 2, 2))
+    if not covariance.any():
+        return np.ascontiguousarray(image)
+    J = one.records(part, {part.kind[:-1]: covariance.shape[1]})
+    sqrt_information = np.empty((len(part.row), 2, 2))
+    _widen(image, J, covariance, part.row, sqrt_information)
+    return sqrt_information
 
 
 def _noise(
@@ -364,10 +350,9 @@ def _noise(
     return float(np.sqrt((gates.stated_weight + len(together) * shown) / (gates.stated_weight + len(together))))
 
 
-def _camera_of(problem: Problem, camera: QueryCamera) -> QueryCamera | None:
+def _camera_of(one: OnePose, camera: QueryCamera) -> QueryCamera | None:
     """The camera that was estimated; None where no lens is like that."""
-    state = problem.variables[f"intrinsics/{camera.model}"].state[0]
-    focal = state[list(camera.kind.focal_indices)]
-    if not (np.isfinite(state).all() and (focal > 0.0).all()):
+    focal = one.params[list(camera.kind.focal_indices)]
+    if not (np.isfinite(one.params).all() and (focal > 0.0).all()):
         return None
-    return QueryCamera(camera.model, state, camera.width, camera.height)
+    return QueryCamera(camera.model, one.params, camera.width, camera.height)

@@ -8,16 +8,14 @@ are about as likely, and there its pull ends.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from groma._typing import BoolArray, FloatArray
-from groma.factors.contract import Factor
+from groma._typing import FloatArray
 from groma.localization.pose.matches import Matches
-from groma.localization.pose.records import landmark_rows, records
-from groma.problem.problem import Problem
+from groma.localization.pose.one_pose import OnePose
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +37,7 @@ class Residuals:
 
 
 def residuals(
-    problem: Problem, weights: Sequence[FloatArray], landmarks: str, count: int, lens: FloatArray | None = None
+    one: OnePose, weights: Sequence[FloatArray], landmarks: str, count: int, lens: FloatArray | None = None
 ) -> Residuals:
     """Whitened residuals of the matches of one kind, ``points`` or ``lines``; each match has a landmark of its own.
 
@@ -49,14 +47,14 @@ def residuals(
     lens = np.zeros((0, 0)) if lens is None else lens
     more = lens.shape[1]
     value, by_pose, spread = np.full((count, 2), np.nan), np.zeros((count, 2, 6 + more)), np.ones(count)
-    for factor, weight in zip(problem.factors, weights, strict=True):
-        rows = landmark_rows(factor, landmarks)
-        if rows is None:
+    for part, weight in zip(one.parts, weights, strict=True):
+        if part.kind != landmarks:
             continue
-        known = more > 0 and any(slot.name == "intrinsics" for slot, _ in factor.references())
-        record = records(problem, factor, {"pose": 6, "intrinsics": len(lens)} if known else {"pose": 6})
+        known = more > 0 and part.has_lens
+        record = one.records(part, {"pose": 6, "intrinsics": len(lens)} if known else {"pose": 6})
         white = weight @ record
         seen = (record != 0.0).any(axis=(1, 2))  # what cannot be evaluated is zero
+        rows = part.row
         value[rows[seen]] = white[seen, :, -1]
         by_pose[rows[seen], :, :6] = white[seen][:, :, :6]
         if known:
@@ -65,35 +63,10 @@ def residuals(
     return Residuals(value, by_pose, spread)
 
 
-def residual_squares_of(
-    problem: Problem, weights: Sequence[FloatArray], matches: Matches
-) -> tuple[FloatArray, FloatArray]:
+def residual_squares_of(one: OnePose, weights: Sequence[FloatArray], matches: Matches) -> tuple[FloatArray, FloatArray]:
     """Squared whitened residuals (N,) of points and (M,) of lines; infinite where a match has no image."""
-    found = []
-    for name, count in (("points", matches.num_points), ("lines", matches.num_lines)):
-        square = np.full(count, np.inf)
-        for factor, weight in zip(problem.factors, weights, strict=True):
-            rows = landmark_rows(factor, name)
-            if rows is not None:
-                square[rows] = ((weight @ records(problem, factor, {}))[..., 0] ** 2).sum(axis=1)
-        found.append(np.where(square > 0.0, square, np.inf))  # what cannot be evaluated is zero
-    return found[0], found[1]
-
-
-def weighted_near(problem: Problem, weights: Sequence[FloatArray], near: tuple[BoolArray, BoolArray]) -> Problem:
-    """Return a problem with other weights; matches that are not near, of points and of lines, have none."""
-    kept: dict[str, BoolArray] = dict(zip(("points", "lines"), near, strict=True))
-    factors = [
-        replace(factor, sqrt_information=np.where(near_of(factor, kept)[:, None, None], weight, 0.0))
-        for factor, weight in zip(problem.factors, weights, strict=True)
-    ]
-    return Problem(problem.variables, factors)
-
-
-def near_of(factor: Factor, near: Mapping[str, BoolArray]) -> BoolArray:
-    """Which rows of a factor are near, of the matches of each kind that are."""
-    for name, kept in near.items():
-        rows = landmark_rows(factor, name)
-        if rows is not None:
-            return kept[rows]
-    return np.ones(len(factor), bool)
+    found = {"points": np.full(matches.num_points, np.inf), "lines": np.full(matches.num_lines, np.inf)}
+    for part, weight in zip(one.parts, weights, strict=True):
+        square = ((weight @ one.records(part, {}))[..., 0] ** 2).sum(axis=1)
+        found[part.kind][part.row] = np.where(square > 0.0, square, np.inf)  # what cannot be evaluated is zero
+    return found["points"], found["lines"]

@@ -21,13 +21,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from groma._typing import IntArray
 from groma.errors import InputError
 from groma.execution import begin, work_with
+from groma.features.matches import LineMatches
+from groma.features.segments import Segments
 from groma.mapping.lines.by_clusters import map_lines_by_clusters
 from groma.mapping.lines.collect import line_map_of
 from groma.mapping.lines.filtering.filters import Evidence, filtered
@@ -35,20 +36,15 @@ from groma.mapping.lines.filtering.texture import load_minimiser
 from groma.mapping.lines.hypotheses.directions import depth_ratios
 from groma.mapping.lines.hypotheses.earlier import EarlierMap
 from groma.mapping.lines.hypotheses.places import find_places
-from groma.mapping.lines.line_map import LineMap, explain
+from groma.mapping.lines.line_map import LineMap
 from groma.mapping.lines.linking.growth import grow
 from groma.mapping.lines.linking.merge import merge_agreeing
 from groma.mapping.lines.linking.tracks import Tracks
-from groma.mapping.lines.matches import MatchProvider, external_matches, segment_matches
+from groma.mapping.lines.matches import MatchProvider
 from groma.mapping.lines.neighbors import covisible_neighbors
 from groma.mapping.lines.options import MapLinesOptions
-from groma.mapping.lines.outcomes import Outcome
 from groma.mapping.lines.views import build_views
 from groma.scene import Scene
-
-if TYPE_CHECKING:
-    from groma.features.matching.wide_baseline import LineMatches
-    from groma.features.segments import Segments
 
 
 def map_lines(
@@ -120,10 +116,8 @@ def map_lines(
         known = None if earlier is None or matches is not None else earlier.known(scene, views, compared, options.noise)
         if earlier is not None and earlier.same_cameras(scene):
             ratios = earlier.lines.depth_ratios  # by the image alone, whatever its pose
-        elif options.use_directions:
-            ratios = depth_ratios(scene, segments, views)
         else:
-            ratios = np.zeros((len(views.image_idx), 2))
+            ratios = depth_ratios(scene, segments, views)
         proposing, linking = partial(report, "proposing lines"), partial(report, "linking segments")
         begin(load_minimiser)
         places = find_places(scene, views, ratios, compared, matches, options, proposing, known)
@@ -138,15 +132,3 @@ def map_lines(
         tracks = filtered(merge_agreeing(unmerged), evidence)
         rows = np.arange(len(views.image_idx))
         return line_map_of(tracks, rows, views.pointers, tracks.outcomes(), compared, places, ratios)
-
-
-__all__ = [
-    "LineMap",
-    "MapLinesOptions",
-    "MatchProvider",
-    "Outcome",
-    "explain",
-    "external_matches",
-    "map_lines",
-    "segment_matches",
-]

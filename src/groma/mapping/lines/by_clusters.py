@@ -21,12 +21,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, TypeVar, overload
+from typing import TypeVar, overload
 
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_work
+from groma.features.segments import Segments
 from groma.mapping.lines.clusters import Cluster, clusters, rows_of_images
 from groma.mapping.lines.collect import line_map_of
 from groma.mapping.lines.filtering.filters import NEARBY, Evidence, SegmentKinds, filtered, is_edge
@@ -43,9 +44,6 @@ from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.outcomes import Outcome
 from groma.mapping.lines.views import build_views, views_of_rows
 from groma.scene import Scene
-
-if TYPE_CHECKING:
-    from groma.features.segments import Segments
 
 _Item = TypeVar("_Item")
 
@@ -187,10 +185,8 @@ def _places_of(asked: tuple[_Part, EarlierMap | None]) -> tuple[Places, FloatArr
     known = None if earlier is None else earlier.known(part.scene, views, near, options.noise)
     if earlier is not None and earlier.same_cameras(part.scene):
         ratios = earlier.lines.depth_ratios
-    elif options.use_directions:
-        ratios = depth_ratios(part.scene, part.segments, views)
     else:
-        ratios = np.zeros((len(views.image_idx), 2))
+        ratios = depth_ratios(part.scene, part.segments, views)
     found = find_places(part.scene, views, ratios, near, None, options, lambda done, total: None, known)
     own = np.flatnonzero(part.is_own[views.image_idx])
     mine = found.take(own)

@@ -11,28 +11,26 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from groma import cameras as camera_models
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
+from groma.features.segments import Segments
 from groma.geometry import quaternion
 from groma.geometry.algebra import unit
 from groma.mapping.groups import num_distinct
 from groma.mapping.lines.build import map_lines
+from groma.mapping.lines.hypotheses.earlier import EarlierMap
 from groma.mapping.lines.line_map import LineMap
+from groma.mapping.lines.matches import LineMatches, MatchProvider
 from groma.mapping.lines.neighbors import covisible_neighbors
 from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.outcomes import Outcome
 from groma.mapping.wide_views import WideViews
 from groma.scene import Cameras, PointObservations, Scene
-
-if TYPE_CHECKING:
-    from groma.features.segments import Segments
-    from groma.mapping.lines.hypotheses.earlier import EarlierMap
-    from groma.mapping.lines.matches import LineMatches, MatchProvider
 
 
 def map_lines_in_views(

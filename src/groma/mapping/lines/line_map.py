@@ -5,18 +5,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from groma._counted import counted
 from groma._typing import FloatArray, IntArray
+from groma.features.segments import Segments
 from groma.mapping.lines.intervals import with_supported_intervals
 from groma.mapping.lines.outcomes import REMEDIES, WORDS, Outcome
 from groma.scene import LineObservations, Lines, Relations, Scene
-
-if TYPE_CHECKING:
-    from groma.features.segments import Segments
 
 #: Groups of segments that :func:`explain` names; the others are counted together (convention: what a sentence can
 #: hold).

@@ -79,7 +79,7 @@ def covisible_neighbors(scene: Scene, num_neighbors: int, min_shared: int = 8) -
     if len(scene.point_observations) == 0:
         return _by_geometry(scene, num_neighbors)
     sees = _sees(scene)
-    shared = _Shared(sees, (sees @ sees.T).tocsr(), scene.points.xyz, scene.cam_centers_in_world, GATES)
+    shared = _Shared(sees, (sees @ sees.T).tocsr(), scene.points.xyz, scene.cam_centers_in_world)
     return map_in_threads(partial(shared.best_of, num=num_neighbors, min_shared=min_shared), range(scene.num_images))
 
 
@@ -92,11 +92,10 @@ class _Shared:
     number: sparse.csr_array
     xyz: FloatArray
     centers: FloatArray
-    gates: NeighborGates
 
     def best_of(self, i: int, num: int, min_shared: int) -> IntArray:
         """The best neighbours of an image."""
-        gates, row = self.gates, slice(self.number.indptr[i], self.number.indptr[i + 1])
+        row = slice(self.number.indptr[i], self.number.indptr[i + 1])
         others, counts = np.asarray(self.number.indices[row]), np.asarray(self.number.data[row], np.int64)
         keep = (others != i) & (counts >= min_shared)
         others, counts = others[keep], counts[keep]
@@ -106,7 +105,7 @@ class _Shared:
         seen = np.zeros(len(self.xyz), bool)
         seen[self._seen_by(i)] = True
         safe = np.maximum(np.array([self._angle(i, int(j), seen) for j in others]), 1e-6)
-        low, high = np.deg2rad(gates.min_angle_deg), np.deg2rad(gates.max_angle_deg)
+        low, high = np.deg2rad(GATES.min_angle_deg), np.deg2rad(GATES.max_angle_deg)
         score = counts * np.minimum(1.0, safe / low) * np.minimum(1.0, high / safe)
         return others[np.argsort(-score, kind="stable")[:num]].astype(np.int64)
 
@@ -114,7 +113,7 @@ class _Shared:
         """Median angle under which rays of shared points meet; ``seen`` (P,) tells the points that image i sees."""
         common = self._seen_by(j)
         common = common[seen[common]]
-        xyz = self.xyz[common[:: max(1, len(common) // self.gates.sample)]]
+        xyz = self.xyz[common[:: max(1, len(common) // GATES.sample)]]
         return float(np.median(_angles(xyz - self.centers[i], xyz - self.centers[j])))
 
     def _seen_by(self, image: int) -> IntArray:

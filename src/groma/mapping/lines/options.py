@@ -51,10 +51,6 @@ class MapLinesOptions:
     #: borders (:mod:`groma.mapping.lines.by_clusters`); 0: all at once (cost: memory
     #: of a process).
     cluster_size: int = 250
-    #: Use lines through known points as further proposals.
-    use_points: bool = True
-    #: Use vanishing directions, alone and with known points.
-    use_directions: bool = True
 
     @staticmethod
     def selective(min_length: float = MIN_LENGTH) -> MapLinesOptions:

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,13 +18,11 @@ from groma import cameras as camera_models
 from groma._trees import kd_tree
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_in_threads, map_work
+from groma.features.segments import Segments
 from groma.gates import gate
 from groma.geometry import quaternion, segment2
 from groma.mapping.groups import grouped
 from groma.scene import Scene
-
-if TYPE_CHECKING:
-    from groma.features.segments import Segments
 
 
 @dataclass(frozen=True)
@@ -126,7 +123,7 @@ def build_views(
         "usable": np.zeros(0, bool), "sigma": np.zeros(0), "range": np.zeros((0, 2)), "inverse_depth": np.zeros((0, 2)),
     }  # fmt: skip
     cameras = scene.keep(points=[], lines=[], planes=[], directions=[])  # points travel with their images
-    parts = [none, *map_work(partial(_columns_of, cameras, (min_length, noise, depth_margin), GATES), work)]
+    parts = [none, *map_work(partial(_columns_of, cameras, (min_length, noise, depth_margin)), work)]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in none}
     sizes = [len(item.ends) for item in segments]
     return LineViews(
@@ -164,13 +161,12 @@ def views_of_rows(
 def _columns_of(
     scene: Scene,
     limits: tuple[float, float, float],
-    gates: ViewGates,
     image: tuple[int, Segments, FloatArray, FloatArray],
 ) -> dict[str, np.ndarray]:
     """Columns of one image: its number, segments, pinhole camera and points."""
     (min_length, noise, depth_margin), (i, segments, camera, points) = limits, image
     columns = _undistorted(scene, i, segments, min_length)
-    depths, search = _depth_range(scene, i, camera, points, columns["ends"], depth_margin, gates)
+    depths, search = _depth_range(scene, i, camera, points, columns["ends"], depth_margin)
     return columns | {"sigma": np.hypot(segments.sigma, noise), "range": search, "inverse_depth": depths[None]}
 
 
@@ -204,7 +200,7 @@ def _undistorted(scene: Scene, image: int, segments: Segments, min_length: float
 
 
 def _depth_range(
-    scene: Scene, image: int, camera: FloatArray, points: FloatArray, ends: FloatArray, margin: float, gates: ViewGates
+    scene: Scene, image: int, camera: FloatArray, points: FloatArray, ends: FloatArray, margin: float
 ) -> tuple[FloatArray, FloatArray]:
     """Range (2,) of the inverse depths in an image, and where to look for each segment (n, 2)."""
     pose = scene.cam_from_world[image]
@@ -213,24 +209,24 @@ def _depth_range(
     if len(depth):
         pixel = (points @ camera[:2, :3].T + camera[:2, 3]) / depth[:, None]
         inverse = 1.0 / depth
-        low, high = np.quantile(inverse, [gates.depth_quantile, 1.0 - gates.depth_quantile])
-        near = _range_near(ends, pixel, inverse, margin, gates.num_near)
+        low, high = np.quantile(inverse, [GATES.depth_quantile, 1.0 - GATES.depth_quantile])
+        near = _range_near(ends, pixel, inverse, margin)
         return np.array([low / margin, high * margin]), near
     if scene.num_images == 1:
         return np.full(2, np.nan), np.zeros((len(ends), 2))
     centers = scene.cam_centers_in_world
-    away = np.sort(np.linalg.norm(centers - centers[image], axis=1))[1 : 1 + gates.num_baselines]
-    everywhere = np.array(gates.inverse_depth_range) / max(away.mean(), 1e-12)
+    away = np.sort(np.linalg.norm(centers - centers[image], axis=1))[1 : 1 + GATES.num_baselines]
+    everywhere = np.array(GATES.inverse_depth_range) / max(away.mean(), 1e-12)
     return everywhere, np.tile(everywhere, (len(ends), 1))
 
 
-def _range_near(ends: FloatArray, pixel: FloatArray, inverse: FloatArray, margin: float, num_near: int) -> FloatArray:
+def _range_near(ends: FloatArray, pixel: FloatArray, inverse: FloatArray, margin: float) -> FloatArray:
     """Range of the inverse depths of the points around each segment, widened by the margin."""
     if len(ends) == 0:
         return np.zeros((0, 2))
     first, second = ends[:, :2], ends[:, 2:]
     places = np.stack([first, 0.5 * (first + second), second], axis=1)
-    near = min(num_near, len(pixel))
+    near = min(GATES.num_near, len(pixel))
     found = kd_tree(pixel).query(places.reshape(-1, 2), k=near)[1].reshape(len(ends), -1)
     values = inverse[found]
     return np.column_stack([values.min(1) / margin, values.max(1) * margin])

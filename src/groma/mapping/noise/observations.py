@@ -29,7 +29,8 @@ import numpy as np
 import scipy  # its parts are imported when something of them is first used
 
 from groma._typing import FloatArray, IntArray
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.gates import gate
 from groma.mapping.noise.landmarks import GATES as LANDMARK_GATES

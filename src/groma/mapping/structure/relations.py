@@ -9,7 +9,7 @@ uncertain to decide; and it lies where the structure was observed, not on its ex
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -56,6 +56,9 @@ class RelationGates:
 
 GATES = RelationGates()
 
+#: What is near a plane, by all that it depends on: tables of points and of lines.
+_Near = dict[tuple[bytes, bytes, float, bytes], tuple[FloatArray, FloatArray]]
+
 
 @dataclass(frozen=True)
 class Landmarks:
@@ -77,6 +80,12 @@ class Landmarks:
     #: (P,) and (L,) length that a pixel spans there, scene units.
     point_pixel: FloatArray
     line_pixel: FloatArray
+
+    @cached_property
+    def usable(self) -> tuple[tuple[IntArray, FloatArray], tuple[IntArray, FloatArray]]:
+        """Numbers and places of the usable points, and of the usable segments."""
+        points, lines = np.flatnonzero(self.point_usable), np.flatnonzero(self.line_usable)
+        return (points, self.points[points]), (lines, self.segments[lines])
 
 
 @dataclass(frozen=True)
@@ -125,8 +134,11 @@ def on_planes(
     found: PlaneSet,
     level: float,
     least: tuple[float, float],
+    known: _Near | None = None,
 ) -> tuple[Pairs, Pairs]:
     """Points on planes and lines on planes; their probabilities have to exceed the least of their kind.
+
+    What is near planes is kept in ``known``, for the next time.
 
     Walls are rough: how far what belongs to a plane deviates from it is estimated with the share of what belongs there.
     What stands out on the plane itself, within its own noise, is still held to it as such.
@@ -134,7 +146,8 @@ def on_planes(
     num = len(found)
     if num == 0:
         return Pairs.none(), Pairs.none()
-    parts = list(zip(*map_in_threads(partial(_near_plane, marks, found, GATES.layer), range(num)), strict=True))
+    near = partial(_near_plane, marks, found, GATES.layer, {} if known is None else known)
+    parts = list(zip(*map_in_threads(near, range(num)), strict=True))
     points, lines = np.concatenate(parts[0]), np.concatenate(parts[1])
     table = np.concatenate([points, lines])
     mark, owner = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
@@ -188,25 +201,36 @@ def _label(of_usable: IntArray, usable: BoolArray) -> IntArray:
     return label
 
 
-def _near_plane(marks: Landmarks, found: PlaneSet, layer: float, k: int) -> tuple[FloatArray, FloatArray]:
+def _near_plane(marks: Landmarks, found: PlaneSet, layer: float, known: _Near, k: int) -> tuple[FloatArray, FloatArray]:
     """Points and lines in the layer of a plane, where it is connected.
 
     Tables of landmark, plane, height and its deviation, whitened axes of the heights: two offsets, two variances.
     """
-    usable_points, usable_lines = np.flatnonzero(marks.point_usable), np.flatnonzero(marks.line_usable)
-    plane, covariance, half = found.planes[k], found.covariance[k], layer * found.band[k]
-    height = np.abs(marks.points[usable_points] @ plane[:3] + plane[3])
-    rows = usable_points[height < half]
-    rows = rows[connected_to(found.places[k], marks.points[rows], marks.point_spacing[rows], plane)]
+    same = found.planes[k].tobytes(), found.covariance[k].tobytes(), float(found.band[k]), found.places[k].tobytes()
+    if same not in known:
+        half = layer * found.band[k]
+        known[same] = _in_layer(marks, found.planes[k], found.covariance[k], half, found.places[k])
+    points, lines = known[same]
+    return np.insert(points, 1, k, axis=1), np.insert(lines, 1, k, axis=1)
+
+
+def _in_layer(
+    marks: Landmarks, plane: FloatArray, covariance: FloatArray, half: float, places: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The tables of :func:`_near_plane` without the number of the plane."""
+    (usable, at), (usable_lines, ends) = marks.usable
+    near = np.abs(at @ plane[:3] + plane[3]) < half
+    rows, at = usable[near], at[near]
+    near = (np.abs(ends @ plane[:3] + plane[3]) < half).all(axis=1)
+    lines, ends = usable_lines[near], ends[near]
+    spacing = np.concatenate([marks.point_spacing[rows], marks.end_spacing[lines].ravel()])
+    near = connected_to(places, np.concatenate([at, ends.reshape(-1, 3)]), spacing, plane)
+    lines, rows = lines[near[len(rows) :].reshape(-1, 2).all(axis=1)], rows[near[: len(rows)]]
     height, variance = _point_heights(marks, rows, plane, covariance)
     unused = np.zeros(len(rows))
-    columns = [rows, np.full(len(rows), k), height, np.sqrt(variance), height, unused, variance, unused]
-    ends = marks.segments[usable_lines]
-    lines = usable_lines[(np.abs(ends @ plane[:3] + plane[3]) < half).all(axis=1)]
-    near = connected_to(found.places[k], marks.segments[lines].reshape(-1, 3), marks.end_spacing[lines].ravel(), plane)
-    lines = lines[near.reshape(-1, 2).all(axis=1)]
+    points = np.column_stack([rows.astype(np.float64), height, np.sqrt(variance), height, unused, variance, unused])
     height, spread, offset, variance = _line_heights(marks, lines, plane, covariance)
-    return np.column_stack(columns), np.column_stack([lines, np.full(len(lines), k), height, spread, offset, variance])
+    return points, np.column_stack([lines.astype(np.float64), height, spread, offset, variance])
 
 
 def on_lines(marks: Landmarks, level: float, least: float) -> Pairs:

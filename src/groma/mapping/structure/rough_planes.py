@@ -69,7 +69,7 @@ def on_fitted_planes(
     points, lines : Pairs
         What lies on them.
     """
-    fitted = partial(_fitted_in_turn, marks, level=level, least=least, min_support=min_support)
+    fitted = partial(_fitted_in_turn, marks, level=level, least=least, min_support=min_support, known={})
     found = fitted(planes)
     into, joined = _joined(marks, *found, fitted, level)
     if joined is found[0]:
@@ -79,17 +79,17 @@ def on_fitted_planes(
 
 
 def _fitted_in_turn(
-    marks: Landmarks, planes: PlaneSet, level: float, least: tuple[float, float], min_support: int
+    marks: Landmarks, planes: PlaneSet, level: float, least: tuple[float, float], min_support: int, known: dict
 ) -> _Told:
     """Tell members of planes and fit planes to them in turn."""
-    points, lines = on_planes(marks, planes, level, least)
+    points, lines = on_planes(marks, planes, level, least, known)
     for _ in range(_ROUNDS):
         rough = _deviations(points, lines, len(planes))
         rough[_num_members(points, lines, len(planes)) < min_support] = 0.0
         if not rough.any():
             break
         planes = _fitted(marks, planes, points, lines, rough)
-        points, lines = on_planes(marks, planes, level, least)
+        points, lines = on_planes(marks, planes, level, least, known)
     return planes, points, lines
 
 

@@ -143,9 +143,3 @@ def _check(covariances: Covariances, variables: tuple[Variable, ...], kinds: tup
         if group not in known or known[group].manifold.kind != kind:
             found = known[group].manifold.kind if group in known else "no group"
             raise InputError(f"Expected a variable of kind {kind!r}; {group!r} is {found}. Pass (group, index).")
-
-
-__all__ = [
-    "Quantity", "angle_between_lines", "angle_between_planes", "angle_line_plane", "distance_between_cameras",
-    "distance_between_planes", "distance_point_line", "distance_point_plane", "length_between_points",
-]  # fmt: skip

@@ -162,7 +162,7 @@ class ShardedProblem:
         )
         self._sums = SharedSystem(self._kept, self._reducer, formed)
         first = replace(options, initial_damping=options.initial_damping or DAMPING.points)
-        self._damping = damping_from(first_damping(variables, first))
+        self._damping = damping_from(first_damping(variables, first), variables)
         self._last_ratio = self._curvature = 1.0
         self._here = ShardedTrial(cost=np.nan, states={name: group.state for name, group in variables.items()})
         #: Whether the shared system is that of the present states and damping.

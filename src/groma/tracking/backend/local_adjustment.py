@@ -12,7 +12,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.adjustment.assemble import AssemblyOptions, assemble, first_camera_gauge
+from groma.adjustment.assemble import assemble, first_camera_gauge
+from groma.adjustment.assembly_options import AssemblyOptions
 from groma.geometry import se3
 from groma.problem.problem import Problem
 from groma.scene import Lines, Relations, Scene

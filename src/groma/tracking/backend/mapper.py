@@ -352,7 +352,7 @@ class Mapper:
         """
         self.current = number
         turn = self.right.turn
-        if not self.options.adjust_at_end or len(self.map.living()) < 2:
+        if len(self.map.living()) < 2:
             return None, turn
         report = self._adjust_all()
         if self.camera.baseline > 0:
@@ -376,7 +376,7 @@ class Mapper:
         """
         self.current = number
         track_map, options, gates = self.map, self.options, self.options.gates.landmark_planes
-        wanted = options.planes and options.relations and options.adjust_at_end
+        wanted = options.planes and options.relations
         if not wanted or (track_map.planes.found > 0).any() or len(track_map.living()) < 2:
             return None, None
         scene = map_to_scene(track_map, self.camera, min_views=1)

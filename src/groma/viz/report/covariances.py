@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -14,9 +14,7 @@ from groma._typing import FloatArray, IntArray
 from groma.bounded.arrays import Header, opened_arrays
 from groma.errors import FileFormatError, InputError
 from groma.io.reading import existing, reading
-
-if TYPE_CHECKING:
-    from groma.scene import Scene
+from groma.scene import Scene
 
 
 class Uncertainty(Protocol):

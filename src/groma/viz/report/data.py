@@ -4,24 +4,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.scene import Scene
 from groma.scene.line_intervals import line_pieces
 from groma.scene.patches import PALETTE, patch_area, patch_groups
 from groma.viz import colours as _colours
-from groma.viz.drawable import junctions
+from groma.viz.drawable import Drawable, junctions
 from groma.viz.framing import starting_view
 from groma.viz.pack import pack, pack_bytes, pack_whole
+from groma.viz.report.covariances import LandmarkCovariances
 from groma.viz.report.kept import Kept, places_of
 from groma.viz.statistics import LineStatistics, images_of, line_statistics
-
-if TYPE_CHECKING:
-    from groma.scene import Scene
-    from groma.viz.drawable import Drawable
-    from groma.viz.report.covariances import LandmarkCovariances
 
 
 def scene_data(

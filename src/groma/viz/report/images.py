@@ -7,21 +7,19 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.execution import begin
+from groma.scene import Scene
 from groma.scene.line_intervals import one_line_per_interval
+from groma.viz.drawable import Drawable
 from groma.viz.pack import pack, pack_whole, thin
 from groma.viz.pictures import ImageFiles, image_file, jpeg_address, read_picture, warn_of_names_outside
 from groma.viz.report.kept import Kept, places_of
 from groma.viz.report.overlays import is_straight, projected_segments
-
-if TYPE_CHECKING:
-    from groma.scene import Scene
-    from groma.viz.drawable import Drawable
 
 #: Photographs in the page, the longer side of each, pixels, and what all of them may weigh, characters.
 MAX_PHOTOS = 60

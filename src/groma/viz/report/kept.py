@@ -8,16 +8,13 @@ of its segments are in the page; where there are too many, fewer lines have segm
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from groma._typing import BoolArray, IntArray
+from groma.scene import Scene
 from groma.scene.line_intervals import line_pieces
 from groma.viz.pack import thin
-
-if TYPE_CHECKING:
-    from groma.scene import Scene
 
 #: More points, and more pieces of lines, than this are thinned out evenly.
 MAX_POINTS = 200_000

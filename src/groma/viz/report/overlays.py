@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import html
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,13 +17,11 @@ from groma import cameras
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
 from groma.geometry import se3
+from groma.scene import Scene
 from groma.scene.line_intervals import one_line_per_interval
 from groma.viz import colours as _colours
 from groma.viz.pictures import ImageFiles, Picture, data_address, image_file, read_picture
 from groma.viz.statistics import LineStatistics, line_statistics
-
-if TYPE_CHECKING:
-    from groma.scene import Scene
 
 #: Camera models under which the image of a straight line is straight.
 _STRAIGHT = ("PINHOLE", "SIMPLE_PINHOLE")

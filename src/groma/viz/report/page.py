@@ -20,13 +20,14 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from groma._version import __version__
 from groma.errors import InputError, OutputError
 from groma.execution import begin
+from groma.scene import Scene
 from groma.scene.checks import check_scene_given
 from groma.viz.drawable import Drawable, drawable
 from groma.viz.pack import script_json
@@ -36,10 +37,6 @@ from groma.viz.report.covariances import LandmarkCovariances
 from groma.viz.report.data import scene_data
 from groma.viz.report.images import Photographs, image_data, page_photographs
 from groma.viz.report.kept import kept
-
-if TYPE_CHECKING:
-    from groma.scene import Scene
-
 
 #: The program of the page, in order: data, drawing, what is chosen, what hands do.
 SCRIPTS = (

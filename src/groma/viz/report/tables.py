@@ -5,22 +5,20 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from groma._counted import counted
 from groma._typing import FloatArray, IntArray
+from groma.scene import Scene
 from groma.scene.counts import num_relations
 from groma.scene.patches import PALETTE, patch_area, patch_groups
 from groma.viz import colours as _colours
+from groma.viz.drawable import Drawable
 from groma.viz.report import charts as _charts
 from groma.viz.report import digits as _digits
 from groma.viz.statistics import images_of
-
-if TYPE_CHECKING:
-    from groma.scene import Scene
-    from groma.viz.drawable import Drawable
 
 #: Planes, and directions, in the tables.
 MAX_LISTED_PLANES = 15

@@ -14,24 +14,21 @@ from __future__ import annotations
 import html
 import os
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.evaluation.trajectory import apply_similarity
+from groma.evaluation.trajectory import TrajectoryScores, apply_similarity
 from groma.geometry import quaternion
+from groma.io.trajectories import Trajectory
+from groma.scene import Scene
 from groma.viz.framing import horizontal, upward
 from groma.viz.pictures import ImageFiles
 from groma.viz.report import digits as _digits
 from groma.viz.report import tables as _page_tables
 from groma.viz.report.page import PageContents, write_report
 from groma.viz.report.path_charts import Curve, legend, over_time, path
-
-if TYPE_CHECKING:
-    from groma.evaluation.trajectory import TrajectoryScores
-    from groma.io.trajectories import Trajectory
-    from groma.scene import Scene
 
 #: What a frame can be besides tracked, in words, and its colour in charts.
 _STATUSES = {

@@ -9,13 +9,13 @@ precision, and sizes in the viewer mean the same for every scene. Numbers for pe
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.geometry import quaternion
 from groma.io.drawn import openings
+from groma.scene import Scene
 from groma.scene.line_intervals import line_pieces
 from groma.scene.similarity import Similarity
 from groma.scene.upright import upward
@@ -23,9 +23,6 @@ from groma.viz import colours as _colours
 from groma.viz.colours import Colours
 from groma.viz.drawable import drawable, junctions
 from groma.viz.statistics import LineStatistics, line_statistics
-
-if TYPE_CHECKING:
-    from groma.scene import Scene
 
 #: Half the size of the scene in the frame of the viewer.
 REACH = 5.0

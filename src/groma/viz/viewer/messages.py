@@ -4,20 +4,17 @@
 from __future__ import annotations
 
 import html
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from groma._counted import counted
+from groma.scene import Scene
 from groma.viz import colours as _colours
 from groma.viz.pack import thin
 from groma.viz.pictures import ImageFiles, image_file, read_picture
 from groma.viz.report.overlays import observation_crop, residual_top
 from groma.viz.report.tables import words
-
-if TYPE_CHECKING:
-    from groma.scene import Scene
-    from groma.viz.viewer.content import ViewContent
+from groma.viz.viewer.content import ViewContent
 
 #: Observations in the list of a line, and pieces of photographs with it.
 MAX_LISTED = 40

@@ -11,16 +11,13 @@ import contextlib
 import os
 import threading
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 from groma.errors import InputError
+from groma.scene import Scene
 from groma.viz.pictures import ImageFiles
 from groma.viz.viewer.content import view_content
 from groma.viz.viewer.nodes import SceneView
 from groma.viz.viewer.server import Say, start_server, stop_server
-
-if TYPE_CHECKING:
-    from groma.scene import Scene
 
 
 def open_viewer(

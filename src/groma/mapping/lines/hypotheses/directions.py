@@ -15,22 +15,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from groma import cameras as camera_models
 from groma._typing import FloatArray
 from groma.execution import map_work
+from groma.features.segments import Segments
 from groma.features.vanishing_points import find_vanishing_points
 from groma.gates import gate
 from groma.geometry import quaternion
 from groma.mapping.lines.views import LineViews
 from groma.scene import Scene
-
-if TYPE_CHECKING:
-    from groma.features.segments import Segments
 
 
 @dataclass(frozen=True)
@@ -58,30 +54,30 @@ def depth_ratios(scene: Scene, segments: Sequence[Segments], views: LineViews) -
         chosen = chosen[np.argsort(-views.length[rows][chosen], kind="stable")[: GATES.num_voters]]
         model = camera_models.model(scene.cameras.models[camera]), scene.cameras.params_of(camera)
         work.append((segments[i].select(chosen), chosen, views.ray[rows], scene.cam_from_world[i, :4], model))
-    return np.concatenate([np.zeros((0, 2)), *map_work(partial(_ratios_in, GATES), work)])
+    return np.concatenate([np.zeros((0, 2)), *map_work(_ratios_in, work)])
 
 
-def _ratios_in(gates: DirectionGates, image: tuple) -> FloatArray:
+def _ratios_in(image: tuple) -> FloatArray:
     """The same of one image, from its longest segments, which they are, and the rays of all."""
     longest, chosen, ray, cam_from_world, (model, params) = image
     ratios = np.zeros((len(ray), 2))
-    if len(chosen) < gates.min_voters:
+    if len(chosen) < GATES.min_voters:
         return ratios
     found = find_vanishing_points(longest.ends, longest.sigma, model, params)
     with_one = found.label >= 0
     label, here = found.label[with_one], chosen[with_one]
     sigma = np.sqrt(0.5 * np.trace(found.covariance, axis1=1, axis2=2))[label]
     direction = (found.directions @ quaternion.to_matrix(cam_from_world))[label]
-    ratios[here] = _ratios(ray[here], direction, sigma, gates.max_sigma)
+    ratios[here] = _ratios(ray[here], direction, sigma)
     return ratios
 
 
-def _ratios(ray: FloatArray, direction: FloatArray, sigma: FloatArray, max_sigma: float) -> FloatArray:
+def _ratios(ray: FloatArray, direction: FloatArray, sigma: FloatArray) -> FloatArray:
     first, second = ray[:, 0], ray[:, 1]
     normal = np.cross(first, second)
     below = (normal * np.cross(first, direction)).sum(1)
     above = (normal * np.cross(second, direction)).sum(1)
-    usable = (above * below > 0.0) & (sigma < max_sigma)  # otherwise the line vanishes between its ends
+    usable = (above * below > 0.0) & (sigma < GATES.max_sigma)  # otherwise the line vanishes between its ends
     below = np.where(usable, below, 1.0)
     ratio = above / below
     slope = np.linalg.norm(np.cross(normal, second) - ratio[:, None] * np.cross(normal, first), axis=1)

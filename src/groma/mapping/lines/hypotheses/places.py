@@ -11,13 +11,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
 from groma.execution import map_largest_first, map_work, num_calls
+from groma.features.matches import LineMatches
 from groma.mapping.groups import grouped
 from groma.mapping.lines.clusters import Cluster, clusters
 from groma.mapping.lines.hypotheses.consensus import choose
@@ -28,9 +28,6 @@ from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.outcomes import Outcome
 from groma.mapping.lines.views import LineViews
 from groma.scene import Scene
-
-if TYPE_CHECKING:
-    from groma.features.matching.wide_baseline import LineMatches
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +109,7 @@ def find_places(
     known : sequence of C Known, optional
         What an earlier map says of each image.
     """
-    points = _points_by_image(scene, views) if options.use_points else [None] * scene.num_images
+    points = _points_by_image(scene, views)
     work = list(zip(range(len(neighbors)), neighbors, points, known or [None] * len(neighbors), strict=True))
     proposer, calls = Proposer(views, ratios, options), num_calls()
     if calls and matches is None:
@@ -130,7 +127,7 @@ def find_places(
 
 
 #: Of one image: its number, neighbours, known points, and what else is known.
-_Image = tuple[int, IntArray, tuple[FloatArray, FloatArray] | None, Known | None]
+_Image = tuple[int, IntArray, tuple[FloatArray, FloatArray], Known | None]
 
 
 @dataclass(frozen=True, eq=False)

@@ -282,7 +282,7 @@ class Questions:
     #: Matched segments (m, 2) and scores (m,) of each neighbour; None takes all segments in the epipolar beam.
     matches: Sequence[tuple[IntArray, FloatArray] | None]
     #: Pixels (p, 2) and inverse depths (p,) of known points seen in the image.
-    near_points: tuple[FloatArray, FloatArray] | None
+    near_points: tuple[FloatArray, FloatArray]
     #: Segments of the image of which the beam is searched; None: all.
     among: BoolArray | None = None
 
@@ -303,7 +303,7 @@ class Proposer:
         views, rows = self.views, self.views.rows(image)
         reached = np.zeros(rows.stop - rows.start, np.int64)
         parts: list[tuple[IntArray, FloatArray]] = [(np.empty((0, 3), np.int64), np.empty((0, 6)))]
-        if near_points is not None and len(near_points[0]):
+        if len(near_points[0]):
             parts.append(lines_through_points(views, rows, self.ratios[rows], near_points, len(neighbors)))
         usable = np.flatnonzero(views.usable[rows] if asked.among is None else views.usable[rows] & asked.among)
         for n, (j, given) in enumerate(zip(neighbors, asked.matches, strict=True)):
