@@ -170,3 +170,32 @@ def test_long_help_has_headings_and_what_every_command_takes_comes_last(capsys):
     assert headings[:3] == ["Arguments", "Options", "Cameras and poses"] and headings[-1] == "General"
     assert said.index("Measurements:") < said.index("--positions") < said.index("Depth maps:")
     assert said.index("General:") < said.index("--no-color") < said.index("--help", said.index("--no-color"))
+
+
+@pytest.mark.parametrize(
+    ("command", "usage"),
+    [
+        ("synth", "[OPTIONS] -o OUT"),
+        ("align", "[OPTIONS] INPUT [REFERENCE]"),
+        ("localize", "[OPTIONS] MAP QUERIES... -o OUT"),
+        ("warmup", "[OPTIONS] [PART...]"),
+    ],
+)
+def test_the_usage_names_all_that_must_be_given_and_brackets_what_may_be(command, usage, capsys):
+    assert run([command, "--help"]) == 0
+    assert capsys.readouterr().out.splitlines()[0] == f"Usage: groma {command} {usage}"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--max-iterations", "1.5"], "must be a whole number."),
+        (["--max-iterations", "-3"], "must be 0 or more."),
+        (["--mark-sigma", "much"], "must be a number."),
+        (["--keep", "alwys"], "'alwys' is not one of 'auto', 'always', 'never'. Did you mean 'always'?"),
+    ],
+    ids=" ".join,
+)
+def test_a_wrong_value_is_told_in_plain_words(words, said, capsys):
+    assert run(["adjust", "x", *words]) == 2
+    assert capsys.readouterr().err.endswith(f"Error: Invalid value for '{words[0]}': {said}\n")

@@ -100,6 +100,18 @@ def test_on_a_terminal_the_line_is_as_wide_as_it_and_vanishes(monkeypatch, capsy
     assert said == "\r\x1b[K  stage 2 of 2: a stage with a name  [##########..........]  1/2\r\x1b[K"
 
 
+def test_a_terminal_that_cannot_rewrite_a_line_gets_none(monkeypatch, capsys):
+    be_terminal(monkeypatch)
+    monkeypatch.setenv("TERM", "dumb")
+    with Console(False, False, None).stages() as stages:
+        stages("finding lines", 1, 2)
+    assert capsys.readouterr().err == ""
+
+
+def test_a_line_too_narrow_for_all_says_how_far_and_leaves_out_the_time():
+    assert screen_line("finding lines", "25/100, 30 s left", 0.25, 30) == "  finding lines  25/100"
+
+
 def test_verbose_leaves_a_line_for_every_stage_with_its_time(capsys):
     with Console(False, True, None).stages() as stages:
         stages("first", 0, 1)
@@ -143,6 +155,17 @@ def test_tables_are_aligned_and_leave_out_what_nothing_has(capsys):
         "  points   1,200  0.5 px",
         "  lines       42",
     ]
+
+
+def test_the_header_of_a_table_that_is_too_wide_is_broken_into_few_lines():
+    header, row = ("", "length found", "for 90 % right"), ["points", "1.25", "3.0 %"]
+    assert style.aligned(header, [row]) == style.aligned(header, [row], 38)
+    two = ["          length   for 90", "           found  % right"]
+    three = ["                    for", "          length   90 %", "           found  right"]
+    for width, top in [(37, two), (25, two), (24, three), (5, three)]:  # narrower than 23 it cannot be
+        heads, (line,) = style.aligned(header, [row], width)
+        assert heads == top
+        assert line.split() == ["points", "1.25", "3.0", "%"] and len(line) == max(map(len, heads))
 
 
 def test_what_is_wrong_in_every_file_is_told_once(capsys):

@@ -41,9 +41,9 @@ def selfcheck(
 ) -> None:
     """Compare the analytic derivatives of every factor with numeric ones, and with reference values.
 
-    Prints the worst deviation per factor, with --verbose per block. With --nees, simulates scenes of known noise and prints how the
-    errors of poses, points, lines, planes, directions and intrinsics compare with their covariances. Exit code 1 if
-    something is too large.
+    Prints the worst deviation per factor, with --verbose per block. With --nees, simulates scenes of known noise and
+    prints how the errors of poses, points, lines, planes, directions and intrinsics compare with their covariances.
+    Exit code 1 if something is too large.
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.input import refuse_idle

@@ -46,7 +46,8 @@ def track(
         ),
     ] = None,
     camera_params: Annotated[
-        str | None, _options.CAMERAS.option("The parameters, in COLMAP's order and pixel coordinates.", metavar="F,CX,CY,...")
+        str | None,
+        _options.CAMERAS.option("The parameters, in COLMAP's order and pixel coordinates.", metavar="F,CX,CY,..."),
     ] = None,
     kind: Annotated[
         str | None,
@@ -162,7 +163,7 @@ def _say(console: Console, numbers: dict[str, Any]) -> None:
     depth = numbers.get("depth_camera", {})
     if depth.get("used") and abs(depth["inverse_offset"]) > depth["sigma"]:
         offset, sigma = depth["inverse_offset"], depth["sigma"]
-        console.say(f"Inverse depths are off by {offset:+.4f} ± {sigma:.4f}; this is taken into account.")
+        console.say(f"Inverse depths are off by {offset:+.4f} ± {sigma:.4f} per metre; this is taken into account.")
     scores = numbers.get("reference", {})
     if "ate_rmse" in scores:
         drift = scores["drift_percent"]

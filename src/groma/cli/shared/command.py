@@ -93,10 +93,16 @@ class Command(TyperCommand):
         except Exception as error:  # of wrong usage: its class is Click's or Typer's own, by Typer's version
             if isinstance(error, typer.BadParameter):
                 error.message = _in_plain_words(error.message)
-            if hasattr(error, "format_message") and is_terminal(sys.stderr):
-                words = wrapped(f"Error: {error.format_message()}", terminal_width()).removeprefix("Error: ")
-                error.format_message = lambda: words
+            if is_terminal(sys.stderr):
+                _break_message(error)
             raise
+
+
+def _break_message(error: Any) -> None:
+    """Break the message of wrong usage between words where somebody looks at it; other errors stay as they are."""
+    if hasattr(error, "format_message"):
+        message = wrapped(f"Error: {error.format_message()}", terminal_width()).removeprefix("Error: ")
+        error.format_message = lambda: message
 
 
 #: What Typer says of a value that it cannot take, and what groma says.

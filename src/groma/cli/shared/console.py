@@ -45,8 +45,9 @@ class Console:
     def table(self, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         """Print an aligned table unless --quiet; nothing if it has no rows."""
         if rows and not self.quiet:
-            first, *rest = aligned(header, rows)
-            print("\n".join([paint(first, "bold", self._stream), *rest]), file=self._stream, flush=True)
+            top, lines = aligned(header, rows, terminal_width() if is_terminal(self._stream) else None)
+            top = [paint(line, "bold", self._stream) for line in top]
+            print("\n".join([*top, *lines]), file=self._stream, flush=True)
 
     def warn(self, text: str) -> None:
         """Print a warning on standard error unless --quiet."""

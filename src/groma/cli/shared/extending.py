@@ -21,7 +21,10 @@ if TYPE_CHECKING:
 _Made = TypeVar("_Made")
 Names = tuple[str, ...]
 #: Stages as they are said: of a map that is described, of photographs, of two maps.
-DESCRIBING: Names = ("describing the images of the map", "placing the points of the map")
+DESCRIBING: Names = (
+    *("describing the images of the map", "placing the points of the map"),
+    "comparing images of the map with the rest",
+)
 LOCALIZING, COMPARING = "localising photographs", "looking for photographs of the second map in the first"
 _WITH_POINTS: Names = ("finding points in images", "placing points")
 

@@ -17,7 +17,10 @@ _ERASE = "\r\x1b[K"
 
 
 class Line:
-    """One line on a terminal, which vanishes at the end; in a pipe, a file or where TERM is dumb, one every ten seconds."""
+    """One line on a terminal, which vanishes at the end.
+
+    In a pipe, in a file and where TERM is dumb, one every ten seconds.
+    """
 
     def __init__(self, quiet: bool) -> None:
         self._rewrites = not quiet and can_rewrite(sys.stderr)

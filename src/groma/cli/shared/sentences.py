@@ -151,16 +151,18 @@ def say_contributions(console: Console, entries: Sequence[Mapping[str, Any]]) ->
         return
     kinds = list(dict.fromkeys(kind for entry in entries for kind in entry["rmse_px"]))
     header = ["with", *(f"rms {kind}" for kind in kinds), "moved", "known to", "off"]
-    console.say("By kind of landmark: how far camera centres moved, how well they are known, how far they are off.")
+    console.say(
+        "By kind of landmark: rms in pixels; how far camera centres moved, how well they are known, and how far off."
+    )
     rows = []
     for number, entry in enumerate(entries):
         known, off = entry["center_sigma"], entry["center_error"]
         rows.append([
-            ("and " if number else "") + entry["added"],
-            *(f"{entry['rmse_px'][kind]:.3f} px" if kind in entry["rmse_px"] else "" for kind in kinds),
+            ("and " if number else "") + entry["added"].replace(" and ", ", "),
+            *(f"{entry['rmse_px'][kind]:.3f}" if kind in entry["rmse_px"] else "" for kind in kinds),
             f"{entry['moved']:.3g}" if number else "",
             "" if known is None else f"{known:.3g}",
-            "" if off is None else f"{off:.4g}, {entry['rotation_error_deg']:.4f}°",
+            "" if off is None else f"{off:.3g}, {entry['rotation_error_deg']:.4f}°",
         ])  # fmt: skip
     console.table(header, rows)
     for number, entry in enumerate(entries):

@@ -12,6 +12,8 @@ Style = Literal["bold", "dim", "red", "green", "yellow", "cyan"]
 _CODES: dict[Style, int] = {"bold": 1, "dim": 2, "red": 31, "green": 32, "yellow": 33, "cyan": 36}
 #: Between the columns of a table, and before its first.
 _GAP = "  "
+#: Of the header of a table.
+_MOST_LINES = 3
 
 
 def is_terminal(stream: TextIO | None) -> bool:
@@ -50,15 +52,37 @@ def wrapped(text: str, width: int) -> str:
     return "\n".join(lines)
 
 
-def aligned(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return the lines of a table, its header first: names to the left, numbers to the right.
+def aligned(
+    header: Sequence[str], rows: Sequence[Sequence[str]], width: int | None = None
+) -> tuple[list[str], list[str]]:
+    """Return the lines of a table, those of its header apart: names to the left, numbers to the right.
 
-    Columns in which no row has anything are left out.
+    Columns in which no row has anything are left out. The header of a table wider than ``width`` is broken between
+    words, into as few lines as make it fit.
     """
     shown = [column for column in range(len(header)) if column == 0 or any(row[column] for row in rows)]
-    cells = [[line[column] for column in shown] for line in (header, *rows)]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    return [
-        (_GAP + _GAP.join([first.ljust(widths[0]), *map(str.rjust, rest, widths[1:])])).rstrip()
-        for first, *rest in cells
-    ]
+    cells = [[row[column] for column in shown] for row in rows]
+    least = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    names, height = [header[column] for column in shown], 1
+    while True:
+        heads = [_broken(name, room, height) for name, room in zip(names, least, strict=True)]
+        widths = [max(room, *map(len, head)) for room, head in zip(least, heads, strict=True)]
+        if width is None or sum(widths) + len(_GAP) * len(widths) <= width or height >= _MOST_LINES:
+            break
+        height += 1
+
+    def line(parts: Sequence[str]) -> str:
+        first, *rest = parts
+        return (_GAP + _GAP.join([first.ljust(widths[0]), *map(str.rjust, rest, widths[1:])])).rstrip()
+
+    return [line(parts) for parts in zip(*heads, strict=True)], [line(parts) for parts in cells]
+
+
+def _broken(head: str, room: int, height: int) -> list[str]:
+    """Return the words of a column's head in so many lines, the first ones empty, no wider than need be."""
+    lines = [head]
+    for width in range(max(room, 1), len(head) + 1):
+        lines = textwrap.wrap(head, width, break_long_words=False, break_on_hyphens=False)
+        if len(lines) <= height:
+            break
+    return [""] * (height - len(lines)) + lines
