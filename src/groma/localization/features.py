@@ -22,6 +22,7 @@ from groma.features.images import GrayImage
 from groma.features.matching.descriptor import Descriptors, describe
 from groma.features.registry import DETECTORS
 from groma.features.segments import Segments
+from groma.features.sift import Blobs, describe_upright, find_blobs
 from groma.gates import gate
 from groma.localization.pose.camera import QueryCamera
 from groma.mapping.image_segments import Straightener
@@ -78,9 +79,7 @@ class DescribedImage:
 
 def find_points(image: GrayImage) -> DescribedPoints:
     """Find and describe blobs of any scale and direction."""
-    sift = cv2.SIFT_create(FEATURES.max_points, contrastThreshold=FEATURES.contrast)  # type: ignore[attr-defined]
-    found, described = sift.detectAndCompute(image, None)
-    return _described(found, described, False)
+    return _described(find_blobs(image, FEATURES.max_points, FEATURES.contrast), False)
 
 
 def find_corners(image: GrayImage) -> DescribedPoints:
@@ -93,22 +92,15 @@ def find_corners(image: GrayImage) -> DescribedPoints:
 
 def describe_places(image: GrayImage, pixels: FloatArray) -> tuple[DescribedPoints, IntArray]:
     """Describe given places (n, 2), upright; those at the border are left out: also return the rows that are left."""
-    size = 2.0 * FEATURES.corner_scale
-    places = [cv2.KeyPoint(float(u) - 0.5, float(v) - 0.5, size, 0.0, 1.0, 0, row) for row, (u, v) in enumerate(pixels)]
-    kept, described = cv2.SIFT_create().compute(image, places)  # type: ignore[attr-defined]
-    return _described(kept, described, True), np.array([one.class_id for one in kept], np.int64)
+    found, rows = describe_upright(image, pixels, 2.0 * FEATURES.corner_scale)
+    return _described(found, True), rows
 
 
-def _described(found, described, upright: bool) -> DescribedPoints:
-    if described is None or not len(found):
-        return DescribedPoints.empty()
-    pixels = np.array([one.pt for one in found], np.float64) + 0.5
-    scale = 0.5 * np.array([one.size for one in found], np.float64)  # OpenCV tells the diameter
-    root = np.sqrt(described / np.maximum(described.sum(axis=1, keepdims=True), 1e-9))
+def _described(found: Blobs, upright: bool) -> DescribedPoints:
+    root = np.sqrt(found.descriptors / np.maximum(found.descriptors.sum(axis=1, keepdims=True), 1e-9))
     octets = np.minimum(np.round(_LENGTH * root), 255.0).astype(np.uint8)
-    return DescribedPoints(
-        pixels, np.maximum(FEATURES.sigma * scale, FEATURES.min_sigma), octets, np.full(len(found), upright)
-    )
+    sigma = np.maximum(FEATURES.sigma * (0.5 * found.size), FEATURES.min_sigma)
+    return DescribedPoints(found.pixels, sigma, octets, np.full(len(found), upright))
 
 
 def mirrored(points: DescribedPoints, width: int) -> DescribedPoints:

@@ -43,7 +43,7 @@ from groma.mapping.photographs import read_gray
 from groma.scene import PointObservations, Points, Scene
 
 #: Of the format of the file; another one is built anew.
-_VERSION = 4
+_VERSION = 5
 #: Images that the features of an image are matched with (cost: time).
 _NEIGHBORS = 12
 

@@ -147,10 +147,11 @@ def describe(image: npt.NDArray[np.generic], segments: Segments, band_rows: int 
     """
     if band_rows < 1 or not (math.isfinite(scale) and scale > 0.0):
         raise InputError(f"band_rows and scale must be positive; got {band_rows} and {scale}. Defaults are 5 and 1.")
-    gray = to_gray(image).astype(np.float32)
+    gray = to_gray(image)
     raw = np.zeros((len(segments), DESCRIPTOR_SIZE), dtype=np.float64)
     if len(segments):
-        smooth = cv2.GaussianBlur(gray, (0, 0), max(scale, DESCRIPTORS.min_blur), borderType=cv2.BORDER_REPLICATE)
+        blur = max(scale, DESCRIPTORS.min_blur)
+        smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), blur, borderType=cv2.BORDER_REPLICATE)
         gradient_u = cv2.Scharr(smooth, cv2.CV_32F, 1, 0, borderType=cv2.BORDER_REPLICATE)
         gradient_v = cv2.Scharr(smooth, cv2.CV_32F, 0, 1, borderType=cv2.BORDER_REPLICATE)
         _describe_all(
