@@ -48,10 +48,10 @@ def rigid(rotation: FloatArray, place: FloatArray, path: object, convention: Pos
             f"{path}: expected rotation matrices; that of image {row + 1} stretches by {scale[row].tolist()}. "
             "Divide it by its scale."
         )
-    turned = np.linalg.det(nearest)
-    if turned.min() < 0.0:
+    mirrors = np.linalg.det(nearest) < 0.0
+    if mirrors.any():
         raise FileFormatError(
-            f"{path}: expected right-handed axes; the matrix of image {int(turned.argmin()) + 1} mirrors. Turn the "
+            f"{path}: expected right-handed axes; the matrix of image {int(mirrors.argmax()) + 1} mirrors. Turn the "
             "sign of one axis."
         )
     return convention.cam_from_world(nearest, place)
