@@ -71,7 +71,7 @@ _SUBPACKAGES = frozenset(
         "problem scene solver testing tracking viz"
     ).split()
 )
-__all__ = sorted([*_HOME, *_SUBPACKAGES])
+__all__ = sorted([*_HOME, *_SUBPACKAGES])  # pyright: ignore[reportUnsupportedDunderAll]  (it reads the stub)
 
 
 def __getattr__(name: str) -> object:

@@ -8,6 +8,8 @@ import pytest
 
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.geometry import quaternion, se3
+from groma.mapping.map import MapOptions
+from groma.mapping.surveyed import adjust_with_survey
 from groma.scene import Cameras, Scene
 from groma.scene.camera import CAMERA, Rigs, Sensors
 from groma.scene.image import Frames, Images
@@ -72,3 +74,13 @@ def test_a_rig_that_the_images_contradict_is_told(held, apart, refined, said):
     else:
         assert len(about_rigs) == 1
         assert re.search(said, about_rigs[0])
+
+
+@pytest.mark.parametrize("refined", [False, True])
+def test_rigs_of_a_map_with_measurements_are_estimated_where_that_is_asked(refined):
+    def say(doing: str, done: int, total: int) -> None:
+        assert doing == "adjusting with measurements" and done <= total
+
+    found = adjust_with_survey(rig_scene(TURNED), MapOptions(refine_rigs=refined), say)
+    off = 2.0 * np.degrees(np.arccos(min(abs(found.sensors.cam_from_rig[1, :4] @ MOUNTED[:4]), 1.0)))
+    assert off < 0.1 if refined else off == pytest.approx(1.5)

@@ -13,9 +13,9 @@ from _scene import exact_scene
 from groma.io import write_scene
 from groma.viz.viewer import live
 
-CHROMIUM = next((path for path in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if path), None)
+CHROMIUM = next((path for path in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if path), "")
 playwright = pytest.importorskip("playwright.sync_api", reason="needs Playwright: pip install playwright")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+pytestmark = pytest.mark.skipif(not CHROMIUM, reason="needs Chromium")
 
 
 def test_a_running_track_in_the_browser(tmp_path):

@@ -14,9 +14,9 @@ from _scene import exact_scene
 from groma.viz.report.covariances import LandmarkCovariances
 from groma.viz.report.page import PageContents, write_report
 
-CHROMIUM = next((path for path in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if path), None)
+CHROMIUM = next((path for path in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if path), "")
 playwright = pytest.importorskip("playwright.sync_api", reason="needs Playwright: pip install playwright")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+pytestmark = pytest.mark.skipif(not CHROMIUM, reason="needs Chromium")
 
 ORANGE = """name => {
   const one = document.getElementById(name), flat = document.createElement("canvas");
@@ -346,7 +346,7 @@ def test_hands_turn_move_and_bring_the_view_back(opened):
 FRAMES = """cost => {
   const tick = 1000 / 60;
   let now = 0, late = 0, drawn = 0;
-  lastFrame = -Infinity; clearTimeout(rest);
+  awaited = lastFrame = 0; clearTimeout(rest);
   for (let i = 0; i < 360; i++) {
     frame(now);
     const ticks = Math.max(1, Math.ceil(cost * share / tick));
@@ -364,3 +364,25 @@ def test_frames_come_in_time_and_show_what_there_is_time_for(opened):
         late, drawn = page.evaluate(FRAMES, cost)
         assert late < 0.15
         assert drawn > 0.65 * 16.7 / cost
+
+
+def test_what_makes_single_frames_wait_hides_nothing(opened):
+    """Loading, resting and one frame that is late: all of the scene stays in view."""
+    page = opened()
+    assert page.evaluate("""async () => {
+      const shares = [], wait = took => new Promise(done => setTimeout(done, took));
+      for (const pause of [30, 120, 400, 30]) { await wait(pause); draw(); await new Promise(requestAnimationFrame); shares.push(share); }
+      return shares;
+    }""") == [1, 1, 1, 1]  # fmt: skip
+    late = "([first, ...more]) => { awaited = lastFrame = first; for (const time of more) frame(time); return share; }"
+    assert page.evaluate(late, [1000, 1016, 1100, 1116]) == 1
+    assert page.evaluate(late, [2000, 2016, 2100, 2184]) < 1
+
+
+def test_the_glide_follows_the_clock(opened):
+    """However few frames there are."""
+    page = opened()
+    glides = "took => { [blend, target, glided] = [0, 1, 0]; for (const time of took) glide(time); return blend; }"
+    many, few = (page.evaluate(glides, list(range(10, 101, step))) for step in (10, 90))
+    assert many == pytest.approx(few, abs=1e-9)
+    assert many == pytest.approx(1 - np.exp(-100 / 67))

@@ -140,6 +140,7 @@ def adjust_with_survey(points: Scene, options: Any, say: Callable[[str, int, int
     told = AdjustOptions(
         refine_poses=options.refine_poses,
         refine_intrinsics=bool(options.refine_intrinsics),
+        refine_rigs=options.refine_rigs,
         max_iterations=options.max_iterations,
         threads=options.threads,
     )

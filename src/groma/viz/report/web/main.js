@@ -21,15 +21,18 @@ $("gain").addEventListener("input", drawImage);
 $("home").onclick = () => { startView(); draw(); };
 
 // ------------------------------------------------------------------ before and after
-let target = last;
+const GLIDE = 67; // milliseconds in which two thirds of what is left are gone, however many frames there are
+let target = last, glided = 0;
 function showState(state) {
   target = state;
+  glided = performance.now();
   document.querySelectorAll("#state button").forEach(b => b.setAttribute("aria-pressed", String(+b.dataset.state === target)));
   requestAnimationFrame(glide);
 }
-function glide() {
-  const gap = target - blend;
-  blend = Math.abs(gap) < 0.01 ? target : blend + gap * 0.22;
+function glide(time) {
+  const gap = (target - blend) * Math.exp(-Math.max(0, time - glided) / GLIDE);
+  glided = time;
+  blend = Math.abs(gap) < 0.01 ? target : target - gap;
   if (both && painted !== (blend < 0.5 ? 0 : last)) { recolour(); drawImage(); }
   draw();
   if (blend !== target) requestAnimationFrame(glide);

@@ -5,25 +5,26 @@ const renderer = (noWebgl ? null : webglRenderer(canvas)) || flatRenderer(canvas
 const shown = { points: true, lines: true, planes: true, cameras: true, junctions: false };
 let ratio = 1, view = viewOf(1, 1), pending = false, painted = -1;
 // While the view moves, only as many points and lines are drawn as there is time for; all of them once it rests. What was
-// too much for a frame is tried again slowly, so that not every other frame is late.
+// too much for a frame is tried again slowly, so that not every other frame is late. A frame is late if it came long after it
+// was asked for, while the view moves, and only two in turn tell that all is too much: a page that loads makes frames wait, too.
 const FRAME = 1000 / 60, SLOW = 1.3 * FRAME, LEAST = 0.02, REST = 180; // milliseconds
-let share = 1, roof = 1, lastFrame = -Infinity, rest = 0;
+let share = 1, roof = 1, awaited = 0, lastFrame = 0, wasLate = false, rest = 0;
 
-function draw() { if (!pending) { pending = true; requestAnimationFrame(frame); } }
+function draw() { if (!pending) { pending = true; awaited = performance.now(); requestAnimationFrame(frame); } }
 function frame(time) {
   pending = false;
-  const took = time - lastFrame;
-  lastFrame = time;
-  if (took > SLOW && took < 1000) {
+  const moves = awaited < lastFrame + FRAME, took = time - Math.max(awaited, lastFrame), isLate = moves && took > SLOW;
+  if (isLate && (wasLate || share < 1)) {
     roof = Math.max(LEAST, 0.9 * share);
     share = Math.max(LEAST, share * Math.max(0.3, 0.9 * FRAME / took));
-  } else if (took <= SLOW) {
+  } else if (!isLate) {
     roof = Math.min(1, 1.01 * roof);
     share = Math.min(roof, 1.1 * share);
   }
+  [lastFrame, wasLate] = [time, isLate];
   paint(share);
   clearTimeout(rest);
-  if (share < 1) rest = setTimeout(() => { paint(1); lastFrame = -Infinity; }, REST);
+  if (share < 1) rest = setTimeout(paint, REST);
 }
 function paint(share = 1) {
   ratio = Math.min(devicePixelRatio || 1, 2);
