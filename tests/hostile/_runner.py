@@ -66,6 +66,7 @@ def run(first: int, last: int, seed: int, only: str = "") -> tuple[collections.C
 def _worker(all_targets: list, first: int, last: int, seed: int) -> Iterator[tuple[int, str, str]]:
     """Yield what became of the cases from ``first`` on, until the worker dies or is done."""
     ours, theirs = os.pipe()
+    _wait_for_threads()
     child = os.fork()
     if child == 0:
         status = 1
@@ -91,6 +92,14 @@ def _worker(all_targets: list, first: int, last: int, seed: int) -> Iterator[tup
         ended_by = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
         outcome = "too slow" if ended_by in (signal.SIGALRM, signal.SIGPROF) else "crash"
         yield done + 1, outcome, f"ended by signal {ended_by}, status {status}"
+
+
+def _wait_for_threads(seconds: float = 5.0) -> None:
+    """Wait until the system has ended the threads that Python has: on its way out one holds a lock of OpenCV, which
+    would stay locked in a process that is forked then."""
+    end = time.monotonic() + seconds
+    while len(os.listdir("/proc/self/task")) > 1 and time.monotonic() < end:
+        time.sleep(0.001)
 
 
 def _work(all_targets: list, first: int, last: int, seed: int, pipe: int) -> None:
