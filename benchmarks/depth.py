@@ -33,7 +33,8 @@ from groma.geometry import quaternion, se3
 from groma.io import read_scene
 from groma.io.depth_maps import DepthMaps
 from groma.io.sequences import open_sequence
-from groma.mapping.map import MapOptions, map_images
+from groma.mapping.map import map_images
+from groma.mapping.options import MapOptions
 from groma.scene import Cameras, Scene
 
 KINDS = ("none", "metric", "relative")

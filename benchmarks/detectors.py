@@ -36,7 +36,8 @@ from groma.features.segments import Segments
 from groma.io import read_scene
 from groma.mapping.checkpoints import Stages
 from groma.mapping.lines.confidence import DEFAULT_CONFIDENCE
-from groma.mapping.map import MapOptions, adjust_points, map_images, map_segments
+from groma.mapping.map import adjust_points, map_images, map_segments
+from groma.mapping.options import MapOptions
 from groma.scene import Scene
 from groma.scene.line_intervals import one_line_per_interval
 

@@ -35,7 +35,8 @@ from groma.mapping.lines.confidence import (
     line_evidence,
     usual_distance,
 )
-from groma.mapping.map import MapOptions, adjust_points, map_segments
+from groma.mapping.map import adjust_points, map_segments
+from groma.mapping.options import MapOptions
 from groma.scene import Scene
 from groma.scene.line_intervals import line_pieces, supported_lengths
 

@@ -33,7 +33,8 @@ from groma.mapping.lines.confidence import DEFAULT_CONFIDENCE
 from groma.mapping.lines.matches import segment_matches
 from groma.mapping.lines.neighbors import covisible_neighbors
 from groma.mapping.lines.options import MapLinesOptions
-from groma.mapping.map import MapOptions, adjust_points, map_segments
+from groma.mapping.map import adjust_points, map_segments
+from groma.mapping.options import MapOptions
 from groma.scene import Scene
 from groma.scene.line_intervals import one_line_per_interval
 

@@ -65,7 +65,8 @@ def rotations(quaternions):
 def measure(images, model, copies, threads):
     """Map K copies; return the numbers of one row."""
     from groma.io import read_scene
-    from groma.mapping.map import MapOptions, map_images
+    from groma.mapping.map import map_images
+    from groma.mapping.options import MapOptions
 
     scene = repeat(read_scene(model).points_only(), copies)
     seconds, peaks, last = {}, {}, ["reading", time.process_time()]

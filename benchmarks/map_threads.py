@@ -44,7 +44,8 @@ def run(images, model, threads):
     from groma.execution import share_memory, work_with
     from groma.features.images import one_opencv_thread
     from groma.io import read_scene
-    from groma.mapping.map import MapOptions, map_images
+    from groma.mapping.map import map_images
+    from groma.mapping.options import MapOptions
 
     mark("reading the model")
     share_memory()

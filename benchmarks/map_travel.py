@@ -17,7 +17,8 @@ from pathlib import Path
 from groma.execution import work_with
 from groma.io import read_scene
 from groma.mapping.lines.options import MapLinesOptions
-from groma.mapping.map import MapOptions, map_images
+from groma.mapping.map import map_images
+from groma.mapping.options import MapOptions
 
 
 class Counting(Executor):

@@ -26,7 +26,8 @@ from groma.evaluation import evaluate_poses
 from groma.geometry import quaternion
 from groma.io import read_scene, write_scene
 from groma.io.colmap.sfm import PointModelOptions
-from groma.mapping.map import MapOptions, map_images
+from groma.mapping.map import map_images
+from groma.mapping.options import MapOptions
 from groma.mapping.posed.given import scene_at_poses
 from groma.mapping.posed.place import place_photographs
 from groma.scene import Scene

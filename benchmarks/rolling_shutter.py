@@ -31,7 +31,8 @@ from _rolling import disturbed, photographs, rolling_scene, video
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.rolling_shutter import adjust_rolling_shutter, with_rolling_shutter
 from groma.evaluation import evaluate_poses
-from groma.mapping.map import MapOptions, map_images
+from groma.mapping.map import map_images
+from groma.mapping.options import MapOptions
 
 CASES = {"photographs": lambda seed: photographs(seed=seed), "video": lambda seed: video()}
 

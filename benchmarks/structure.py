@@ -39,8 +39,9 @@ from groma.geometry.algebra import norm, unit
 from groma.io import read_archive, write_archive
 from groma.mapping.checkpoints import Stages
 from groma.mapping.lines.confidence import with_confidence
-from groma.mapping.map import MapOptions, adjust_points, find_lines
+from groma.mapping.map import adjust_points, find_lines
 from groma.mapping.noise.observations import line_end_correlation, noise_px, with_point_noise
+from groma.mapping.options import MapOptions
 from groma.mapping.structure.find import StructureOptions, _landmarks, find_structure
 from groma.mapping.structure.flatness import surface_noise_px
 from groma.scene import Directions, Relations, Scene

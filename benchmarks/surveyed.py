@@ -70,8 +70,9 @@ from groma.evaluation import evaluate_poses
 from groma.evaluation.alignment import align_points
 from groma.factors import Ref
 from groma.factors.priors.position_prior import PositionPrior
-from groma.mapping.map import MapOptions, MapResult, map_images
+from groma.mapping.map import MapResult, map_images
 from groma.mapping.noise.observations import noise_px, with_point_noise
+from groma.mapping.options import MapOptions
 from groma.mapping.unused import without_unused
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables

@@ -102,7 +102,8 @@ ROOMS: Rooms = (
     (
         "Mapping and tracking",
         {
-            "groma.mapping.map": ("MapOptions", "map_images"),
+            "groma.mapping.map": ("map_images",),
+            "groma.mapping.options": ("MapOptions",),
             "groma.mapping.result": ("MapResult",),
             "groma.mapping.lines.build": ("LineMap", "MapLinesOptions", "map_lines"),
             "groma.mapping.structure.find": ("StructureOptions", "find_structure"),

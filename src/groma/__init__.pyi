@@ -74,8 +74,8 @@ from groma.localization.pose.absolute_pose import AbsolutePose as AbsolutePose
 from groma.localization.pose.absolute_pose import PoseOptions as PoseOptions
 from groma.localization.pose.absolute_pose import estimate_absolute_pose as estimate_absolute_pose
 from groma.localization.pose.camera import QueryCamera as QueryCamera
-from groma.mapping.map import MapOptions as MapOptions
 from groma.mapping.map import map_images as map_images
+from groma.mapping.options import MapOptions as MapOptions
 from groma.mapping.result import MapResult as MapResult
 from groma.mapping.surveyed import SurveyedResult as SurveyedResult
 from groma.mapping.surveyed import adjust_surveyed as adjust_surveyed

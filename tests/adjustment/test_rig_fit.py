@@ -8,7 +8,7 @@ import pytest
 
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.geometry import quaternion, se3
-from groma.mapping.map import MapOptions
+from groma.mapping.options import MapOptions
 from groma.mapping.surveyed import adjust_with_survey
 from groma.scene import Cameras, Scene
 from groma.scene.camera import CAMERA, Rigs, Sensors

@@ -14,7 +14,8 @@ from groma.cli.main import run
 from groma.io import read_scene, write_scene
 from groma.io.survey import CoordinateSystem, Places
 from groma.mapping import map as mapping
-from groma.mapping.map import MapOptions, MapResult, map_images
+from groma.mapping.map import MapResult, map_images
+from groma.mapping.options import MapOptions
 from groma.scene.local_frame import usual_frame
 
 UTM = np.array([4e5, 5.4e6, 200.0])

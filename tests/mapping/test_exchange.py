@@ -16,7 +16,8 @@ from groma.mapping.checkpoints import digest
 from groma.mapping.exchange import matches_for, neighbors_for, similar_neighbors, with_parts
 from groma.mapping.lines.build import map_lines
 from groma.mapping.lines.options import MapLinesOptions
-from groma.mapping.map import MapOptions, map_images
+from groma.mapping.map import map_images
+from groma.mapping.options import MapOptions
 from groma.scene import PointObservations, Points
 from groma.testing import check_detector, check_matcher, check_retrieval
 from groma.tracking import TrackOptions

@@ -18,8 +18,8 @@ from groma.mapping.lines.confidence import (
     usual_distance,
     with_confidence,
 )
-from groma.mapping.map import MapOptions
 from groma.mapping.noise.landmarks import line_noise
+from groma.mapping.options import MapOptions
 from groma.scene import Cameras, LineObservations, Lines, Scene, Similarity
 
 FOCAL = 500.0

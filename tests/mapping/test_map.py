@@ -18,7 +18,8 @@ from groma.features.matches import LineMatches
 from groma.io import read_scene
 from groma.io.colmap.sfm import PointModelOptions
 from groma.mapping import map as mapping
-from groma.mapping.map import MapOptions, map_images
+from groma.mapping.map import map_images
+from groma.mapping.options import MapOptions
 from groma.mapping.photographs import check_names, read_gray
 from groma.scene import Planes, PointObservations, Points
 

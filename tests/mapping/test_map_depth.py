@@ -18,7 +18,8 @@ from groma.io.depth_maps import DepthMaps
 from groma.mapping.depth.noise import cells_of, fitted_noise, shared_errors
 from groma.mapping.depth.points import measure_depths
 from groma.mapping.depth.unit import own_units
-from groma.mapping.map import MapOptions, map_images
+from groma.mapping.map import map_images
+from groma.mapping.options import MapOptions
 from groma.mapping.plan import planned_stages
 from groma.scene import Frames, Images, Rigs, Sensors, Similarity
 

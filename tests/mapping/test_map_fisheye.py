@@ -4,7 +4,8 @@
 import _facade
 import numpy as np
 
-from groma.mapping.map import MapOptions, map_images
+from groma.mapping.map import map_images
+from groma.mapping.options import MapOptions
 
 
 def test_a_fisheye_is_mapped(tmp_path, monkeypatch):

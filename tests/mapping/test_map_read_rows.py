@@ -17,7 +17,8 @@ from groma.evaluation import evaluate_poses
 from groma.features.segments import Segments
 from groma.geometry import quaternion
 from groma.io import read_scene
-from groma.mapping.map import MapOptions, MapResult, map_images
+from groma.mapping.map import MapResult, map_images
+from groma.mapping.options import MapOptions
 from groma.mapping.read_rows import as_measured, mapped_as_measured, read_by_rows, taken_at_once
 
 COUNT = 7

@@ -173,7 +173,8 @@ def test_a_damaged_database_of_points_is_made_again(tmp_path, corner):
 KILLED = """
 import os, signal, sys
 from groma.io import read_scene, write_scene
-from groma.mapping.map import MapOptions, map_images
+from groma.mapping.map import map_images
+from groma.mapping.options import MapOptions
 
 images, model, work, out, when = sys.argv[1:]
 

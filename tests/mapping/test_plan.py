@@ -3,7 +3,8 @@
 
 import pytest
 
-from groma.mapping.map import MapOptions, map_images
+from groma.mapping.map import map_images
+from groma.mapping.options import MapOptions
 from groma.mapping.plan import planned_stages
 
 

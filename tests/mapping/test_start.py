@@ -6,7 +6,7 @@ import pytest
 
 from groma.cameras import model as camera_model
 from groma.geometry import se3
-from groma.mapping.map import MapOptions
+from groma.mapping.options import MapOptions
 from groma.mapping.start import LENS_NOTE, WIDER_LENS, _is_unknown, with_fitting_lens
 from groma.scene import synthetic
 

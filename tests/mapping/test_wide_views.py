@@ -15,7 +15,8 @@ from groma.geometry import quaternion
 from groma.geometry.algebra import unit
 from groma.mapping.lines.in_views import map_lines_in_views
 from groma.mapping.lines.outcomes import Outcome
-from groma.mapping.map import MapOptions, map_images
+from groma.mapping.map import map_images
+from groma.mapping.options import MapOptions
 from groma.mapping.wide_views import WideDetection, WideViews
 
 PANORAMA = ("EQUIRECTANGULAR", (768.0, 384.0), 768, 384)

@@ -371,7 +371,12 @@ def test_what_makes_single_frames_wait_hides_nothing(opened):
     page = opened()
     assert page.evaluate("""async () => {
       const shares = [], wait = took => new Promise(done => setTimeout(done, took));
-      for (const pause of [30, 120, 400, 30]) { await wait(pause); draw(); await new Promise(requestAnimationFrame); shares.push(share); }
+      for (const pause of [30, 120, 400, 30]) {
+        await wait(pause);
+        draw();
+        await new Promise(requestAnimationFrame);
+        shares.push(share);
+      }
       return shares;
     }""") == [1, 1, 1, 1]  # fmt: skip
     late = "([first, ...more]) => { awaited = lastFrame = first; for (const time of more) frame(time); return share; }"

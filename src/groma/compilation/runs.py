@@ -92,7 +92,8 @@ def _cameras(name: str, count: int) -> Cameras:
 def _map_steps() -> Steps:
     from groma.evaluation import cabinet as _cabinet
     from groma.io import read_scene
-    from groma.mapping.map import MapOptions, map_images
+    from groma.mapping.map import map_images
+    from groma.mapping.options import MapOptions
 
     cabinet = _cabinet.folder()
     scene = read_scene(cabinet / "model").subset(np.arange(NUM_PHOTOGRAPHS), min_observations=3)

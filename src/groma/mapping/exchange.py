@@ -11,7 +11,7 @@ import dataclasses
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -25,12 +25,10 @@ from groma.features.retrieval import most_similar
 from groma.features.segments import Segments
 from groma.mapping.lines.matches import ImageReader, MatchProvider, given_matches, segment_matches
 from groma.mapping.lines.neighbors import covisible_neighbors
+from groma.mapping.options import MapOptions
 from groma.mapping.photographs import image_reader
 from groma.mapping.read_rows import check_read_rows
 from groma.scene import Scene
-
-if TYPE_CHECKING:
-    from groma.mapping.map import MapOptions
 
 #: Chooses for every image of a scene which others it is compared with, the best first.
 NeighborChooser = Callable[[Scene], list[IntArray]]

@@ -21,8 +21,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -33,34 +33,30 @@ from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult
 from groma.adjustment.survey.given import Survey
 from groma.execution import begin, work_with
-from groma.features.contract import ImageRetrieval, SegmentDetector, SegmentMatcher
 from groma.features.external import ExternalMatches
 from groma.features.matches import LineMatches
 from groma.features.registry import DETECTORS
 from groma.features.segments import Segments
 from groma.gates import gate
-from groma.io.colmap.rigs import RigDescription
-from groma.io.colmap.sfm import PointModelOptions
 from groma.io.depth_maps import DepthMaps
 from groma.mapping.checkpoint_files import ADJUSTED, LINE_MAP, SCENE, SEGMENTS
 from groma.mapping.checkpoints import Stages, digest, digest_files, stage
 from groma.mapping.depth.segments import with_line_depths
 from groma.mapping.exchange import NeighborChooser, matches_for, neighbors_for, with_parts
 from groma.mapping.image_segments import detect_segments, given_segments
-from groma.mapping.lines.confidence import DEFAULT_CONFIDENCE
 from groma.mapping.lines.hypotheses.earlier import EarlierMap
 from groma.mapping.lines.in_views import map_lines_in_views
 from groma.mapping.lines.line_map import LineMap
 from groma.mapping.lines.matches import MatchProvider
-from groma.mapping.lines.options import MIN_LENGTH, MapLinesOptions
 from groma.mapping.noise.observations import line_bend, line_end_correlation, moved_px, noise_px, with_point_noise
 from groma.mapping.noise.shared import with_shared_noise
+from groma.mapping.options import MapOptions, StageProgress
 from groma.mapping.photographs import check_images, check_number, image_files, image_reader, images_left_out
 from groma.mapping.read_rows import adjust_read_rows, mapped_as_measured, read_by_rows, taken_at_once
 from groma.mapping.refine_points import refine_points
 from groma.mapping.result import SCENES_OF_RESULT, MapResult, result_of
 from groma.mapping.start import start_of
-from groma.mapping.structure.find import StructureOptions, find_structure
+from groma.mapping.structure.find import find_structure
 from groma.mapping.structure.flatness import landmark_noise, surface_noise_px
 from groma.mapping.surveyed import adjust_with_survey, tied
 from groma.mapping.with_depths import find_segment_depths, with_depths
@@ -91,61 +87,6 @@ class MappingGates:
 
 
 GATES = MappingGates()
-
-#: Called with the name of a stage, what is done and what there is to do.
-StageProgress = Callable[[str, int, int], None]
-
-
-@dataclass(frozen=True)
-class MapOptions:
-    """Options of :func:`map_images`."""
-
-    #: Shortest segment, pixels.
-    min_segment_length: float = MIN_LENGTH
-    #: What finds the segments: an object, or a name of :data:`groma.features.registry.DETECTORS`.
-    detector: str | SegmentDetector = "lsd"
-    #: What matches them, likewise; None: the geometry of the poses alone.
-    matcher: str | SegmentMatcher | None = None
-    #: What tells which images to compare where they share too few points, likewise; None: nothing does.
-    retrieval: str | ImageRetrieval | None = None
-    #: Place the observations of points anew by the grey levels around them: three times less noise, which pays where
-    #: the calibration is as good.
-    refine_points: bool = False
-    lines: MapLinesOptions = field(default_factory=MapLinesOptions)
-    structure: StructureOptions = field(default_factory=StructureOptions)
-    #: Smallest probability that a line is right, for it to stay in the map.
-    min_confidence: float = DEFAULT_CONFIDENCE
-    #: Look for planes and common directions.
-    find_planes: bool = True
-    #: Move the poses; without, only landmarks are adjusted.
-    refine_poses: bool = True
-    #: Estimate focal lengths and distortion too; None: where ``camera_model`` changes the given cameras.
-    refine_intrinsics: bool | None = None
-    threads: int | None = None
-    #: Most steps of each adjustment (cost: time; most end before).
-    max_iterations: int = 50
-    #: The camera model: where points are reconstructed, of all cameras (None: SIMPLE_RADIAL, or RADIAL where residuals
-    #: show a second coefficient of distortion); else the model that the given cameras are changed to (None: they keep
-    #: theirs), and what it adds is estimated with the calibration.
-    camera_model: str | None = None
-    #: Where points are reconstructed: the parameters of the cameras if they are known, seed.
-    camera_params: tuple[float, ...] | None = None
-    #: Where poses are reconstructed: ``incremental`` or ``global``, pycolmap's mappers.
-    mapper: str = "incremental"
-    seed: int = 0
-    #: Where points are reconstructed: images taken at the same moment by cameras fixed to each other.
-    rigs: tuple[RigDescription, ...] = ()
-    #: Estimate where cameras sit on their rig.
-    refine_rigs: bool = False
-    #: What photographs were read along, ``rows`` or ``columns``; None: taken at once, unless a given model says how.
-    rolling_shutter: str | None = None
-    #: Leave measurements in that the test for gross errors would take out.
-    keep_suspects: bool = False
-
-    def point_model(self, threads: bool = True) -> PointModelOptions:
-        """How points are reconstructed, with or without the number of threads, on which no result depends."""
-        lens, count = (self.camera_model or "SIMPLE_RADIAL", self.camera_params), self.threads if threads else None
-        return PointModelOptions(*lens, self.seed, count, self.mapper, self.rigs, self.refine_rigs)
 
 
 def map_images(

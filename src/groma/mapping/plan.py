@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
-    from groma.mapping.map import MapOptions
+    from groma.mapping.options import MapOptions
 
 #: What a map begins with: photographs alone, poses without points, or a model of both.
 Start = Literal["photographs", "poses", "model"]

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -35,11 +35,9 @@ from groma.geometry import quaternion
 from groma.geometry.algebra import unit
 from groma.mapping.checkpoint_files import ADJUSTED, SCENE
 from groma.mapping.checkpoints import Stages, stage
+from groma.mapping.options import MapOptions
 from groma.mapping.result import MapResult
 from groma.scene import CameraMotions, Scene
-
-if TYPE_CHECKING:
-    from groma.mapping.map import MapOptions
 
 
 @dataclass(frozen=True)

@@ -9,19 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.misfit.lens import unmodelled_distortion
 from groma.io.colmap.sfm import reconstruct_points
 from groma.mapping.checkpoint_files import PLACED, SCENE
 from groma.mapping.checkpoints import Stages, stage
+from groma.mapping.options import MapOptions, StageProgress
 from groma.mapping.posed.place import place_photographs
 from groma.mapping.posed.placed import PlacedPhotographs
 from groma.scene import Scene
-
-if TYPE_CHECKING:
-    from groma.mapping.map import MapOptions, StageProgress
 
 #: Models with one and with two coefficients of radial distortion.
 SIMPLE_LENS, WIDER_LENS = "SIMPLE_RADIAL", "RADIAL"

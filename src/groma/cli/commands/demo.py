@@ -33,7 +33,7 @@ def demo(
     from groma.cli.shared.mapping import run_map, say_map, write_map
     from groma.evaluation import cabinet
     from groma.io import read_scene
-    from groma.mapping.map import MapOptions
+    from groma.mapping.options import MapOptions
 
     console.say("58 photographs of a filing cabinet, nearly without texture (TUM RGB-D benchmark), about a minute.")
     folder, work = cabinet.folder(), output.with_name(output.name + ".work")

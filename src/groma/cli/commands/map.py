@@ -17,7 +17,7 @@ from groma.errors import InputError
 
 if TYPE_CHECKING:
     from groma.io.colmap.rigs import RigDescription
-    from groma.mapping.map import MapOptions
+    from groma.mapping.options import MapOptions
     from groma.scene import Scene
 
 
@@ -189,7 +189,7 @@ def map_(
     from groma.io import read_scene
     from groma.localization.extension import in_world_of
     from groma.mapping.lines.options import MapLinesOptions
-    from groma.mapping.map import MapOptions
+    from groma.mapping.options import MapOptions
 
     options = MapOptions(
         min_segment_length=min_length,

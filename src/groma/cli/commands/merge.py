@@ -44,7 +44,7 @@ def merge(
     from groma.cli.shared.extending import merge_maps
     from groma.cli.shared.mapping import run_map, say_map, stages_of_map, write_map
     from groma.localization.extension import in_world_of
-    from groma.mapping.map import MapOptions
+    from groma.mapping.options import MapOptions
 
     options = MapOptions(threads=console.threads, seed=seed)
     stages = stages_of_map(options)

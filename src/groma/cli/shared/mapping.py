@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from groma.cli.shared.console import Console
     from groma.features.external import ExternalMatches
     from groma.io.depth_maps import DepthMaps
-    from groma.mapping.map import MapOptions
+    from groma.mapping.options import MapOptions
     from groma.mapping.plan import Start
     from groma.mapping.result import MapResult
     from groma.scene import Scene
