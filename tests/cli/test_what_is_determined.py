@@ -35,7 +35,7 @@ def test_adjust_says_what_the_data_determine(scenes, here, capsys):
     assert "points" in found["observability"]
     page = (here / "p.html").read_text()
     assert "What the data determine" in page and "Relations" in page
-    assert "point on plane:" in said and "given up" in said
+    assert "point on plane:" in said and "rejected" in said
 
 
 def test_problems_are_said_and_notes_are_not(scenes, here, capsys):

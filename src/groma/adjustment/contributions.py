@@ -74,7 +74,7 @@ def contributions(
     reference: Scene | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[Contribution, ...]:
-    """Adjust a scene by its points alone, then with lines, then with planes and directions, then with points on lines.
+    """Adjust a scene with points only, then with lines, with planes and directions, and with points on lines.
 
     Every adjustment begins at the scene as it is given; kinds that it does not hold are left out.
 
@@ -103,7 +103,7 @@ def contributions(
     options = replace(options or AdjustOptions(), check_lens=False)
     if not (options.points and scene.num_point_observations):
         raise InputError(
-            "Contributions are measured against an adjustment by points alone, and there are no points. "
+            "Contributions are relative to a point-only adjustment, but the scene has no points. "
             "Leave out --contributions, or --no-points."
         )
     found: list[Contribution] = []

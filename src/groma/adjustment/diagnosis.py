@@ -22,7 +22,7 @@ MANY_IMAGES = 300
 def diagnose_scene(
     scene: Scene, options: AssemblyOptions | None = None, problem: Problem | None = None, threads: int = 1
 ) -> Diagnosis:
-    """Say in words what the observations of a scene determine and what they do not.
+    """Report in sentences which quantities the observations of a scene do not determine.
 
     Parameters
     ----------

@@ -77,7 +77,7 @@ class RollingShutterGates:
         0.1, "share", "of the residuals' variance that motions explain, or they are left out", "convention: a tenth"
     )
     determined: float = gate(
-        0.5, "share", "of a motion that the images determine, below which it is told", "convention: half"
+        0.5, "share", "of a motion that the images determine, below which a warning says so", "convention: half"
     )
 
 

@@ -83,7 +83,7 @@ def formats() -> tuple[SceneFormat, ...]:
 
 
 def read_scene(path: str | os.PathLike[str]) -> Scene:
-    """Read a scene: a COLMAP model, a groma archive, a BAL file or one of another program, told by its content.
+    """Read a scene: a COLMAP model, a groma archive, a BAL file or a file of another program, recognised by content.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def write_scene(
     force: bool = False,
     like: Structures | None = None,
 ) -> None:
-    """Write a scene, whole or not at all.
+    """Write a scene atomically.
 
     Parameters
     ----------

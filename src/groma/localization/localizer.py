@@ -59,7 +59,7 @@ GATES = LocalizerGates()
 
 @dataclass(frozen=True)
 class LocalizeOptions:
-    """How photographs are localised."""
+    """Options of localisation."""
 
     #: Use lines besides points.
     lines: bool = True
@@ -76,7 +76,7 @@ class LocalizeOptions:
 
 @dataclass(frozen=True, eq=False)
 class LocalizedImage:
-    """A photograph and where it was taken."""
+    """A localised photograph: its file, camera and pose."""
 
     pose: AbsolutePose
     #: Points and lines of the map that its matches show, as rows of the index and of the map.
@@ -91,7 +91,7 @@ _Found = tuple[AbsolutePose, Candidates]
 
 
 class Localizer:
-    """Places photographs in a map.
+    """Localises photographs in a map.
 
     Parameters
     ----------

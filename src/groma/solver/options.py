@@ -17,7 +17,7 @@ SHARED_SYSTEMS = ("auto", "formed", "products")
 
 @dataclass(frozen=True)
 class SolverOptions:
-    """How a problem is solved. The defaults suit bundle adjustment."""
+    """Options of a solve. The defaults suit bundle adjustment."""
 
     #: Most steps tried, accepted or not (cost: time; most end before).
     max_iterations: int = 50

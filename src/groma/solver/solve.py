@@ -46,7 +46,7 @@ Progress = Callable[[Iteration], bool | None]
 
 @dataclass(frozen=True)
 class Solution:
-    """The problem at its new states, and how it got there."""
+    """The solved problem and the report of the solve."""
 
     problem: Problem
     report: SolveReport

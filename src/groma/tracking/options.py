@@ -13,7 +13,7 @@ from groma.tracking.gates import TrackingGates
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """What is tracked, and when. The defaults suit hand-held cameras and cars at 10 frames a second and more."""
+    """Options of tracking. The defaults suit hand-held cameras and cars at 10 frames a second and more."""
 
     #: Which landmarks take part.
     points: bool = True

@@ -151,7 +151,7 @@ def track(
     map_: str | os.PathLike[str] | None = None,
     source: FrameSource | None = None,
 ) -> SequenceResult:
-    """Track a camera through a sequence, and map points, lines and planes on the way.
+    """Track a camera through a sequence and map points, lines and planes.
 
     Parameters
     ----------

@@ -66,7 +66,7 @@ class PoseGraphOptions:
 
 @dataclass(frozen=True)
 class PoseGraphResult:
-    """The adjusted graph, and how it got there."""
+    """The adjusted pose graph and the report."""
 
     graph: PoseGraph
     report: SolveReport
@@ -121,7 +121,7 @@ def adjust_pose_graph(
     options: PoseGraphOptions | None = None,
     progress: Callable[[Progress], bool | None] | None = None,
 ) -> PoseGraphResult:
-    """Adjust the poses of a graph; held ones stay, and the first of each connected part without one.
+    """Adjust the poses of a graph; in each connected component without a held pose, the first one is held.
 
     Parameters
     ----------

@@ -38,7 +38,10 @@ class RigGates:
     """When residuals show that a rig does not fit."""
 
     share: float = gate(
-        0.1, "share", "of the residuals' variance that free cameras explain and that is told", "convention: a tenth"
+        0.1,
+        "share",
+        "of the residuals' variance explained by free cameras, above which a warning says so",
+        "convention: a tenth",
     )
     max_observations: int = gate(200_000, "observations", "that a rig is judged by", "cost: more tell no more")
     max_iterations: int = gate(10, "steps", "with free cameras", "cost: most need three")

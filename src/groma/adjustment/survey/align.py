@@ -22,7 +22,7 @@ from groma.scene.checks import check_scene_given
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """A scene in another frame, and how well the two agree."""
+    """An aligned scene, and the residuals of the alignment."""
 
     scene: Scene
     #: ``new_from_old``.
@@ -60,7 +60,7 @@ class Alignment:
 
 
 def align(scene: Scene, reference: Scene | Survey) -> Alignment:
-    """Bring a scene into the frame of a reference by a robust similarity.
+    """Align a scene with a reference by a robust similarity.
 
     Parameters
     ----------

@@ -10,7 +10,7 @@ from groma.io.survey import ControlFile, DirectionsFile, DistancesFile, Places, 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """Measurements as files hold them, and how they are meant."""
+    """External measurements as read from files, and their standard deviations."""
 
     #: Positions of cameras: :func:`groma.io.survey.read_positions`, :func:`groma.io.survey.read_exif_positions`.
     positions: Places | None = None

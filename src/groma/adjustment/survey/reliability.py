@@ -81,7 +81,7 @@ _UNCHECKED = 1e-6
 def reliability(
     scene: Scene, problem: Problem | None = None, level: float = GATES.level, power: float = GATES.power
 ) -> Reliability | None:
-    """Say of each measurement of other instruments how well it is checked, and whether it is wrong.
+    """Compute the reliability of each external measurement: redundancy number, test and smallest detectable error.
 
     Parameters
     ----------

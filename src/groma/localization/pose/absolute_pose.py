@@ -44,7 +44,7 @@ from groma.localization.pose.verdict import (
 
 @dataclass(frozen=True)
 class PoseOptions:
-    """How a pose is looked for."""
+    """Options of the estimation of a pose."""
 
     #: Seed of the random samples.
     seed: int = 0
@@ -80,7 +80,7 @@ class MirrorQuestions:
 
 @dataclass(frozen=True, eq=False)
 class AbsolutePose:
-    """A pose and how far it is to be trusted."""
+    """An estimated pose, its covariance and the outcome of its tests."""
 
     #: ``localized``: believed; ``uncertain``: found, but chance, another place, or directions that nothing
     #: determines, are not excluded; ``failed``: none.
@@ -147,7 +147,7 @@ def estimate_absolute_pose(
     covariances: tuple[npt.ArrayLike | None, npt.ArrayLike | None] = (None, None),
     options: PoseOptions | None = None,
 ) -> AbsolutePose:
-    """Estimate where a camera was from matches of points, of lines, or of both; many may be wrong.
+    """Estimate the pose of a camera robustly from matches of points, lines or both.
 
     Parameters
     ----------
