@@ -76,16 +76,16 @@ def contributions(
 ) -> tuple[Contribution, ...]:
     """Adjust a scene with points only, then with lines, with planes and directions, and with points on lines.
 
-    Every adjustment begins at the scene as it is given; kinds that it does not hold are left out.
+    Every adjustment starts from the given scene; kinds of landmarks that it does not have are skipped.
 
     Parameters
     ----------
     scene : Scene
-        The scene; it is not changed.
+        The scene; not modified.
     options : AdjustOptions, optional
-        How to adjust; ``points``, ``lines`` and ``planes`` say what may take part.
+        How to adjust; ``points``, ``lines`` and ``planes`` limit the landmarks used.
     reference : Scene, optional
-        The scene taken for true; images are matched by name.
+        The reference scene; images are matched by name.
     progress : callable, optional
         Called with what is added, before each adjustment.
 

@@ -59,7 +59,7 @@ def write_covariances(
     InputError
         If the name ends otherwise.
     OutputError
-        If something is there already or the file system refuses.
+        If ``path`` exists already or cannot be written.
     """
     check_scene_given(scene)
     if Path(path).suffix not in (".npz", ".json"):

@@ -61,16 +61,16 @@ GATES = LocalizerGates()
 class LocalizeOptions:
     """Options of localisation."""
 
-    #: Use lines besides points.
+    #: Use lines in addition to points.
     lines: bool = True
-    #: Shortest segment, pixels.
+    #: Minimum segment length, pixels.
     min_segment_length: float = 15.0
-    #: Whether the poses and the calibrations of the map were estimated: their errors are in the covariance of each pose
-    #: then. None: as the summary of the map says; both where there is none.
+    #: Whether poses and calibrations of the map were estimated, so that the covariance of each pose includes their
+    #: errors. None: from the summary of the map; both where there is none.
     estimated: tuple[bool, bool] | None = None
-    #: Numbers of the retrieval.
+    #: Thresholds of image retrieval.
     gates: LocalizerGates = field(default_factory=LocalizerGates)
-    #: Of the poses: see there.
+    #: Options of the pose estimation.
     pose: PoseOptions = field(default_factory=PoseOptions)
 
 
@@ -98,11 +98,11 @@ class Localizer:
     map_ : path or Scene
         OUT of ``groma map`` or ``groma track``, a COLMAP model, or a scene.
     images : path, optional
-        Folder of the photographs of the map, or a folder above. By default where they were when the map was described,
+        Folder of the photographs of the map, or a folder above. By default where they were when the map was indexed,
         or made.
     index : path, optional
-        File in which the descriptions of the map are kept, so that they are made once. By default beside the map; a
-        scene without a file is described anew.
+        File of the index of the map, which is made once. By default beside the map; a scene
+        without a file is indexed again.
     options : LocalizeOptions, optional
         Lines, retrieval, poses.
     progress : callable, optional

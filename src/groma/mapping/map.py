@@ -165,7 +165,7 @@ def map_images(
     images : path
         Folder of photographs.
     work : path
-        Folder for finished stages. A second call with the same images, model and options goes on from them.
+        Folder for finished stages. A second call with the same images, model and options resumes from them.
     model : Scene, optional
         Poses, cameras and points of the images; reconstructed from the images if not given. Where it has no points,
         they are found, and the poses are measurements whose noise is estimated.

@@ -84,7 +84,7 @@ def adjust_surveyed(
     progress : callable, optional
         As for :func:`groma.adjust`.
     keep_suspects : bool, optional
-        Leave in what the test for gross errors would take out, and take back what it took out before.
+        Keep gross errors in the adjustment, also those that were taken out before.
 
     Raises
     ------

@@ -67,7 +67,7 @@ def solve(
     Parameters
     ----------
     problem
-        Variables and factors; not changed.
+        Variables and factors; not modified.
     options
         How to solve; the defaults suit bundle adjustment.
     progress

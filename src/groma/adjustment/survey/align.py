@@ -67,13 +67,13 @@ def align(scene: Scene, reference: Scene | Survey) -> Alignment:
     scene : Scene
         In any frame.
     reference : Scene or Survey
-        A scene with images of the same names; where their centres do not tell the rotation the orientations take part.
+        A scene with images of the same names; orientations are used too if their centres do not determine the rotation.
         Or measured positions or control points; they are not added to the scene.
 
     Raises
     ------
     InputError
-        If less than three places are known in both frames, or these are mirror images of each other.
+        If fewer than three positions are known in both frames, or these are mirror images of each other.
     """
     check_scene_given(scene)
     check_scene_given(reference, "reference", Survey)

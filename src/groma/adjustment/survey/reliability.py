@@ -88,9 +88,9 @@ def reliability(
     scene : Scene
         An adjusted scene.
     problem : Problem, optional
-        The problem at its solution; made anew by default, at the noise stated in the scene.
+        The problem at its solution; by default assembled with the noise stated in the scene.
     level, power : float
-        Of the test for gross errors: its level, and the power with which it finds an error of the size told.
+        Level of the test for gross errors, and the power for which the smallest detectable error is computed.
 
     Returns
     -------

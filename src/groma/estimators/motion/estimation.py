@@ -62,7 +62,7 @@ class MotionGates:
 class MotionOptions:
     """Options of the estimation of motions."""
 
-    #: Where the random choice of samples begins.
+    #: Random seed of the samples.
     seed: int = 0
     gates: MotionGates = field(default_factory=MotionGates)
 
