@@ -190,7 +190,7 @@ def with_rolling_shutter(scene: Scene, along: str = "rows") -> Scene:
         )
     if scene.is_metric:
         raise InputError(
-            "Depths, stereo pairs and planes measured in the cameras know no rolling shutter. Leave --rolling-shutter "
+            "Depths, stereo pairs and measured planes do not support a rolling shutter. Leave --rolling-shutter "
             "out, or adjust the scene without them."
         )
     count, centers = scene.num_images, scene.cam_centers_in_world

@@ -291,7 +291,7 @@ def _folder(map_: object, images: str | os.PathLike[str] | None, index: Path | N
         told = images_in_summary(Path(str(map_)))
     if told is None:
         name = "The scene" if isinstance(map_, Scene) else str(map_)
-        raise InputError(f"{name} does not tell where its photographs are. Pass their folder ({OPTIONS}).")
+        raise InputError(f"The folder of the photographs of {name} is unknown. Pass it ({OPTIONS}).")
     return told
 
 

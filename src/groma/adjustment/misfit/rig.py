@@ -86,7 +86,7 @@ def rig_that_does_not_fit(scene: Scene, problem: Problem, threads: int | None = 
         return None
     moved = _moved(sensors.state, freed.variables[SENSORS].state)
     return (
-        "The rig does not fit the images: with free places of its cameras the median residual of points would fall "
+        "The rig does not fit the images: with free poses of its cameras the median residual of points would fall "
         f"from {before:.2f} to {on_rig:.2f} px, and they would {moved}. "
         "Repeat with --refine-rig, or correct the rig file."
     )

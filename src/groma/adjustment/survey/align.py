@@ -102,9 +102,11 @@ def _of_poses(source: FloatArray, target: FloatArray) -> tuple[Similarity, BoolA
             if "mirror" in str(error):
                 raise
     if inliers.sum() == 1:
-        raise InputError("Only one image is known in both frames, which does not tell the scale. Three are needed.")
+        raise InputError(
+            "Only one image is known in both frames, which does not determine the scale. Three are needed."
+        )
     found = pose_alignment(source[inliers], target[inliers])
-    words = "The camera centres alone do not tell the rotation well: the orientations took part."
+    words = "The camera centres alone do not determine the rotation well: orientations were used too."
     return found.similarity, inliers, (words,) if found.by_orientations else ()
 
 

@@ -73,7 +73,7 @@ def merge_maps(
         return merged_model(first, second, folder, "similarity" if scale else "rigid", say)
 
     console.expect_stages(*DESCRIBING, *DESCRIBING, COMPARING, *_WITH_POINTS, *following)
-    merged = _with_progress(console, made, "the descriptions of the maps are kept beside them")
+    merged = _with_progress(console, made, "the indices of the maps are kept beside them")
     console.say(merged.sentence())
     return merged
 
@@ -111,4 +111,4 @@ def _with_progress(console: Console, made: Callable[[Callable[[str, int, int], N
         with interruptible() as interruption, console.stages() as stages, work_with(console.threads):
             return made(interruption.checking(stages))
     except KeyboardInterrupt:
-        raise typer.Exit(PROCESS.tell(f"{kept}: the same command goes on from there.")) from None
+        raise typer.Exit(PROCESS.tell(f"{kept}: the same command resumes there.")) from None

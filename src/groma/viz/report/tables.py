@@ -102,7 +102,7 @@ def chart_cards(
         lengths = _known(_of_kind(after, kind))
         if len(lengths):
             earlier = _known(_of_kind(before, kind)) if before is not None else None
-            caption = f"Share of {len(lengths):,} residuals by their length, on a logarithmic axis. {key}"
+            caption = f"Share of {len(lengths):,} residuals by magnitude, on a logarithmic axis. {key}"
             cards.append((f"Residuals of {name}", caption, _charts.histogram(earlier, lengths)))
     if history is not None:
         caption = "Cost after each step, on a logarithmic axis. Hollow: a step that was refused."
