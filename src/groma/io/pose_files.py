@@ -180,9 +180,9 @@ def _without_calibration(names: Sequence[str], poses: FloatArray, said: tuple[st
 
 def _unclear(place: Path, count: int, names: Sequence[str], what: str) -> InputError:
     return InputError(
-        f"Poses cannot be assigned to photographs: {place} has {counted(count, 'poses')}, there are "
+        f"It cannot be told which of the {counted(count, 'poses')} in {place} is whose: there are "
         f"{counted(len(names), 'photographs')}, and their names, for example {names[0]!r}, are not {what} of the file. "
-        "Rename the photographs, keep only those with a pose, or pass a file with names (transforms.json)."
+        "Name the photographs so, keep only those with a pose, or pass a file with names (transforms.json)."
     )
 
 
@@ -204,8 +204,8 @@ def _by_name(place: Path, names: Sequence[str], photographs: Sequence[str]) -> t
         twice = next((one for one in found if len(one) > 1), None)
         if twice is not None:
             raise InputError(
-                f"Poses in {place} cannot be assigned to photographs: {twice[0]!r} and {twice[1]!r} both match "
-                "one of its names. Use whole paths in the file."
+                f"It cannot be told which pose in {place} is whose: the photographs {twice[0]!r} and {twice[1]!r} both "
+                "fit one of its names. Use whole paths in the file."
             )
         again = Counter(one[0] for one in found if one).most_common(1)[0]
         if again[1] > 1:

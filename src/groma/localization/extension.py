@@ -41,7 +41,9 @@ class ExtendedModel:
             return []
         named = "; ".join(f"{one.name} ({one.status}: {one.sentence})" for one in left[:3])
         more = f"; and {len(left) - 3} more" if len(left) > 3 else ""
-        return [f"Left out, not localised in the map: {len(left)} of {len(self.queries)} photographs. {named}{more}"]
+        return [
+            f"Left out, as the map does not tell where: {len(left)} of {len(self.queries)} photographs. {named}{more}"
+        ]
 
 
 def extended_model(

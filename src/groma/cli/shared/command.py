@@ -46,9 +46,9 @@ Quiet = Annotated[bool, GENERAL.option("Show errors only.", "--quiet", "-q")]
 Verbose = Annotated[bool, GENERAL.option("Show more details.", "--verbose", "-v")]
 Threads = Annotated[
     int | None,
-    GENERAL.option("Use at most N threads. Default: one per core.", "--threads", min=1, metavar="N"),
+    GENERAL.option("Use at most N threads. Default: one per core, where that pays.", "--threads", min=1, metavar="N"),
 ]
-NoColor = Annotated[bool, GENERAL.option("Use no colours (as with the environment variable NO_COLOR).", "--no-color")]
+NoColor = Annotated[bool, GENERAL.option("Use no colours; so does the environment variable NO_COLOR.", "--no-color")]
 
 
 class Command(TyperCommand):

@@ -73,7 +73,7 @@ def merge_maps(
         return merged_model(first, second, folder, "similarity" if scale else "rigid", say)
 
     console.expect_stages(*DESCRIBING, *DESCRIBING, COMPARING, *_WITH_POINTS, *following)
-    merged = _with_progress(console, made, "the indices of the maps are kept beside them")
+    merged = _with_progress(console, made, "the descriptions of the maps are kept beside them")
     console.say(merged.sentence())
     return merged
 
