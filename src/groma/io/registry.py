@@ -28,7 +28,7 @@ HEAD_BYTES = 256
 
 @dataclass(frozen=True)
 class SceneFormat:
-    """How scenes are kept in files of one kind. What is None the format cannot do."""
+    """A scene file format. Operations that it does not support are None."""
 
     #: As ``format=`` spells it.
     name: str
