@@ -19,11 +19,11 @@ from collections.abc import Iterable, Iterator
 
 
 class GromaError(Exception):
-    """Root of all errors that groma raises on purpose."""
+    """Base class of the errors of groma."""
 
 
 class InputError(GromaError, ValueError):
-    """Something passed in cannot be used."""
+    """An argument is invalid."""
 
 
 class ShapeError(InputError):
@@ -31,7 +31,7 @@ class ShapeError(InputError):
 
 
 class FileFormatError(InputError):
-    """A file does not hold what its format promises."""
+    """A file violates its format."""
 
 
 class ProblemError(InputError):

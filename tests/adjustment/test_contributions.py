@@ -72,7 +72,7 @@ def test_each_entry_is_the_adjustment_itself(scenes, found):
 def test_kinds_that_are_not_there_are_left_out(scenes):
     bare = scenes.start.points_only()
     assert [entry.added for entry in contributions(bare, OPTIONS)] == ["points"]
-    with pytest.raises(groma.InputError, match="points alone"):
+    with pytest.raises(groma.InputError, match="point-only"):
         contributions(scenes.start, groma.AdjustOptions(points=False))
 
 
@@ -138,7 +138,7 @@ def test_card_leaves_out_what_is_not_known():
     text = contributions_card([entry, {**moved, "rmse_px": {"points": 0.5, "lines": np.pi}}])
     assert "<td>predicted" not in text and "<td>error" not in text
     assert "3.142" in text and "–" in text
-    assert text.count("<svg") == 1 and "from where points alone put them" in text
+    assert text.count("<svg") == 1 and "from the point-only result" in text
     assert contributions_card([]) == contributions_card(None) == ""
 
 

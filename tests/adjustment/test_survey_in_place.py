@@ -123,7 +123,7 @@ def test_a_scale_bar_gives_the_unit(truth_and_start):
     assert found.similarity.scale == pytest.approx(1 / ELSEWHERE.scale, rel=1e-9)
 
 
-def test_positions_on_a_line_are_told_and_cameras_stand_upright():
+def test_collinear_positions_are_reported_and_cameras_are_upright():
     rng = np.random.default_rng(0)
     line = np.outer(np.linspace(0, 30, 12), [0.6, 0.8, 0.0]) + rng.normal(size=(12, 3)) * 0.01
     truth, _ = made(12)
@@ -135,7 +135,7 @@ def test_positions_on_a_line_are_told_and_cameras_stand_upright():
     scene = truth.with_poses(pose).keep(points=[])
     given = places_of(scene.images.names, line + rng.normal(size=line.shape) * SIGMA)
     found = with_survey(scene.transformed(ELSEWHERE), Survey(positions=given))
-    assert any("on a line" in note for note in found.notes)
+    assert any("are collinear" in note for note in found.notes)
     np.testing.assert_allclose(found.scene.cam_from_world[:, :4], scene.cam_from_world[:, :4], atol=0.01)
 
 
@@ -291,7 +291,7 @@ def test_a_scene_is_aligned_with_another_one(truth_and_start):
     assert found.similarity.scale == pytest.approx(1 / ELSEWHERE.scale) and np.delete(found.angles, 1).max() < 1e-7
     two = align(truth.transformed(ELSEWHERE), truth.subset([1, 6]))
     np.testing.assert_allclose(two.scene.cam_centers_in_world, truth.cam_centers_in_world, atol=1e-9)
-    assert "orientations took part" in two.notes[0]
+    assert "orientations were used too" in two.notes[0]
 
 
 def test_a_scene_is_aligned_with_measurements(truth_and_start):

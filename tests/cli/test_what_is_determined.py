@@ -35,7 +35,7 @@ def test_adjust_says_what_the_data_determine(scenes, here, capsys):
     assert "points" in found["observability"]
     page = (here / "p.html").read_text()
     assert "What the data determine" in page and "Relations" in page
-    assert "point on plane:" in said and "given up" in said
+    assert "point on plane:" in said and "rejected" in said
 
 
 def test_problems_are_said_and_notes_are_not(scenes, here, capsys):
@@ -90,7 +90,7 @@ def test_a_diagnosis_that_fails_is_a_warning(scenes, here, capsys, monkeypatch):
     monkeypatch.setattr("groma.adjustment.diagnosis.diagnose_scene", fail)
     arguments = ["adjust", str(scenes / "points.npz"), "-o", "out.npz", "--max-iterations", "1", "--report", "p.html"]
     assert run(arguments) == 0
-    assert "warning: What the data determine could not be found out: something odd" in capsys.readouterr().err
+    assert "warning: The diagnosis failed: something odd" in capsys.readouterr().err
     assert read_scene(here / "out.npz").num_points > 0
     assert "What the data determine" not in (here / "p.html").read_text()
 

@@ -121,7 +121,7 @@ def test_progress_and_what_is_left_out():
     assert list(dict.fromkeys(stage for stage, _, _ in said)) == [
         "finding planes",
         "finding directions",
-        "finding what lies on what",
+        "finding relations",
     ]
     settled = [done for stage, done, total in said if stage == "finding planes" and total > 1]
     assert len(settled) >= found.num_planes and settled == sorted(settled)

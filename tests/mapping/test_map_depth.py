@@ -125,7 +125,7 @@ def test_cameras_on_a_rig_have_depths_too(corner, small, tmp_path, refined):
 def test_depths_beside_a_rolling_shutter_are_refused_at_once(corner, small, tmp_path):
     """Before minutes are spent on features: here no stage may begin."""
     named = []
-    with pytest.raises(InputError, match="Depths know no rolling shutter"):
+    with pytest.raises(InputError, match="Depths do not support a rolling shutter"):
         map_images(
             corner[0], tmp_path / "work", small, MapOptions(rolling_shutter="rows"),
             lambda name, done, all_: named.append(name), depth=DepthMaps(tmp_path),

@@ -111,5 +111,5 @@ def test_what_images_cannot_do_is_refused(rendered, tmp_path):
     ):
         with pytest.raises(InputError, match=said):
             map_images(folder, tmp_path / "work", truth, options)
-    with pytest.raises(InputError, match="Depths know no rolling shutter"):
+    with pytest.raises(InputError, match="Depths do not support a rolling shutter"):
         read_by_rows(truth, MapOptions(rolling_shutter="rows"), depth=object())

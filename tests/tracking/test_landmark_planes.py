@@ -282,4 +282,4 @@ def test_landmarks_that_do_not_hold_leave_their_plane(stereo):
 
 def test_sentences():
     assert "did not hold" in PlaneOutcome((10, 2), 1, 0, dropped=8).sentence
-    assert "1 landmark did not hold" in PlaneOutcome((10, 2), 1, 1, 9, 2, 1).sentence
+    assert "1 landmark contradicted" in PlaneOutcome((10, 2), 1, 1, 9, 2, 1).sentence

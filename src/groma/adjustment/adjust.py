@@ -59,34 +59,34 @@ COUNTED_OTHERWISE = ("point observations", "line observations", "relations", "re
 
 @dataclass(frozen=True)
 class AdjustOptions:
-    """Options of :func:`adjust`. The defaults suit scenes that come from matching images."""
+    """Options of :func:`adjust`. The defaults suit scenes from feature matches."""
 
     #: ``none``, ``huber``, ``soft_l1``, ``cauchy``, ``tukey``, ``geman_mcclure``, ``barron`` or ``truncated``;
     #: ``auto`` is none for BAL problems; Cauchy for scenes with depths, stereo pairs or planes measured in the cameras,
     #: as in tracking; else Cauchy and then Geman-McClure, because matches contain outliers.
     loss: str = "auto"
-    #: Where the loss begins to bend, in standard deviations (pixels by default); None takes 1, and 2 in the second
-    #: stage of ``auto``.
+    #: Residual at which the loss stops being quadratic, in standard deviations (pixels by default); None: 1, and 2 in
+    #: the second stage of ``auto``.
     loss_scale: float | None = None
-    #: The scale of the loss of segments over that of points, whose residuals may have other tails.
+    #: Scale of the loss of segments over that of points, as their residuals may have other tails.
     line_loss_factor: float = 1.0
-    #: Move the cameras; False adjusts the landmarks alone.
+    #: Estimate the camera poses; False adjusts the landmarks only.
     refine_poses: bool = True
-    #: Change the model of all cameras first, to one that can hold them: PINHOLE to OPENCV, for example. The parameters
-    #: that it adds start at zero.
+    #: Change the model of all cameras first to a more general one: PINHOLE to OPENCV, for example. New parameters start
+    #: at zero.
     camera_model: str | None = None
     #: Estimate focal lengths and distortion; None: for BAL problems, and where ``camera_model`` is given.
     refine_intrinsics: bool | None = None
     #: Estimate principal points too, if intrinsics are refined.
     refine_principal_point: bool = False
-    #: Estimate where cameras sit on their rig.
+    #: Estimate the poses of the cameras on their rigs.
     refine_rigs: bool = False
-    #: Which landmarks take part. Without planes, directions and all relations with them are left out too.
+    #: Which landmarks are used. Without planes, directions and all relations with them are left out too.
     points: bool = True
     lines: bool = True
     planes: bool = True
-    #: Standard deviation of the usual point observation and segment end point, pixels; those of single observations in
-    #: the scene are relative to it. Losses are scaled in these units.
+    #: Common standard deviation of point observations and of segment end points, pixels; those of single observations
+    #: in the scene are relative to it. Losses are scaled in these units.
     point_sigma_px: float = 1.0
     line_sigma_px: float = 1.0
     #: Correlation of the errors of a segment's two ends:
@@ -96,15 +96,15 @@ class AdjustOptions:
     #: ``normal_offset`` or ``quaternion``: see :class:`groma.adjustment.assembly_options.AssemblyOptions`.
     line_residual: str = "endpoints"
     plane_residual: str = "normal_offset"
-    #: Kinds of measurements from outside: see :mod:`groma.adjustment.terms.contract`.
+    #: Terms of your own kinds of measurements: see :mod:`groma.adjustment.terms.contract`.
     terms: tuple[Term, ...] = ()
-    #: How relations between landmarks are measured: ``metric`` or ``pixels``, and how well they hold if metric: see
+    #: Residual of relations between landmarks: ``metric`` or ``pixels``, and the standard deviation if metric: see
     #: :class:`groma.adjustment.assembly_options.AssemblyOptions`.
     structure_form: str = "metric"
     structure_sigma_px: float = SURFACE_SIGMA_PX
-    #: Hold lines together that meet: see :class:`groma.adjustment.assembly_options.AssemblyOptions`.
+    #: Use the relation of lines that meet: see :class:`groma.adjustment.assembly_options.AssemblyOptions`.
     meeting_lines: bool = False
-    #: Most steps tried (cost: time; most end before).
+    #: Maximum number of steps (cost: time; most solves end before).
     max_iterations: int = 50
     #: Stop when the cost falls by less than this fraction in a step.
     function_tolerance: float = 1e-6
@@ -118,11 +118,10 @@ class AdjustOptions:
     line_chart: str = "cartesian"
     #: ``auto``, ``free`` or ``first_camera``: see :class:`groma.adjustment.assembly_options.AssemblyOptions`.
     gauge: str = "auto"
-    #: Steps of each landmark on its own after every joint step; None: 2 under a robust loss or with lines (1 where
+    #: Separate steps of each landmark after every joint step; None: 2 under a robust loss or with lines (1 where
     #: points are tied to lines and there is no loss), else 0.
     landmark_steps: int | None = None
-    #: Look for lens distortion that cameras lack, in the residuals of points, and for rigs that do not fit; warnings
-    #: say so.
+    #: Test for unmodelled lens distortion in the residuals of points, and for rigs that do not fit, and warn.
     check_lens: bool = True
     #: Threads; None takes one for small problems and all cores for large ones.
     threads: int | None = None
@@ -142,7 +141,7 @@ def adjust(
     Parameters
     ----------
     scene
-        The scene; it is not changed.
+        The scene; not modified.
     options
         See :class:`AdjustOptions`.
     progress

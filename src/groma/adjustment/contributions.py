@@ -74,18 +74,18 @@ def contributions(
     reference: Scene | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[Contribution, ...]:
-    """Adjust a scene by its points alone, then with lines, then with planes and directions, then with points on lines.
+    """Adjust a scene with points only, then with lines, with planes and directions, and with points on lines.
 
-    Every adjustment begins at the scene as it is given; kinds that it does not hold are left out.
+    Every adjustment starts from the given scene; kinds of landmarks that it does not have are skipped.
 
     Parameters
     ----------
     scene : Scene
-        The scene; it is not changed.
+        The scene; not modified.
     options : AdjustOptions, optional
-        How to adjust; ``points``, ``lines`` and ``planes`` say what may take part.
+        How to adjust; ``points``, ``lines`` and ``planes`` limit the landmarks used.
     reference : Scene, optional
-        The scene taken for true; images are matched by name.
+        The reference scene; images are matched by name.
     progress : callable, optional
         Called with what is added, before each adjustment.
 
@@ -103,7 +103,7 @@ def contributions(
     options = replace(options or AdjustOptions(), check_lens=False)
     if not (options.points and scene.num_point_observations):
         raise InputError(
-            "Contributions are measured against an adjustment by points alone, and there are no points. "
+            "Contributions are relative to a point-only adjustment, but the scene has no points. "
             "Leave out --contributions, or --no-points."
         )
     found: list[Contribution] = []

@@ -41,7 +41,7 @@ _FIELDS = ("poses", "centers", "points", "lines", "segment_ends", "planes", "dir
 def write_covariances(
     path: str | os.PathLike[str], scene: Scene, uncertainty: SceneUncertainty, force: bool = False
 ) -> None:
-    """Write what is known of the uncertainty of a scene, whole or not at all.
+    """Write the covariances of a scene atomically.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def write_covariances(
     InputError
         If the name ends otherwise.
     OutputError
-        If something is there already or the file system refuses.
+        If ``path`` exists already or cannot be written.
     """
     check_scene_given(scene)
     if Path(path).suffix not in (".npz", ".json"):

@@ -22,14 +22,14 @@ MANY_IMAGES = 300
 def diagnose_scene(
     scene: Scene, options: AssemblyOptions | None = None, problem: Problem | None = None, threads: int = 1
 ) -> Diagnosis:
-    """Say in words what the observations of a scene determine and what they do not.
+    """Report in sentences which quantities the observations of a scene do not determine.
 
     Parameters
     ----------
     scene : Scene
         An adjusted scene, or a start.
     options : AssemblyOptions, optional
-        What of the scene takes part, and its noise; the defaults otherwise.
+        What is assembled from the scene, and its noise; by default that of :class:`AssemblyOptions`.
     problem : Problem, optional
         The problem already made from the scene, at its solution; saves making it again.
     threads : int
@@ -38,7 +38,7 @@ def diagnose_scene(
     Returns
     -------
     Diagnosis
-        Cameras are called by the names of their images, landmarks by their identifiers.
+        Cameras are identified by the names of their images, landmarks by their identifiers.
     """
     check_scene_given(scene)
     near = local_frame(scene)

@@ -77,7 +77,7 @@ class RollingShutterGates:
         0.1, "share", "of the residuals' variance that motions explain, or they are left out", "convention: a tenth"
     )
     determined: float = gate(
-        0.5, "share", "of a motion that the images determine, below which it is told", "convention: half"
+        0.5, "share", "of a motion that the images determine, below which a warning says so", "convention: half"
     )
 
 
@@ -190,7 +190,7 @@ def with_rolling_shutter(scene: Scene, along: str = "rows") -> Scene:
         )
     if scene.is_metric:
         raise InputError(
-            "Depths, stereo pairs and planes measured in the cameras know no rolling shutter. Leave --rolling-shutter "
+            "Depths, stereo pairs and measured planes do not support a rolling shutter. Leave --rolling-shutter "
             "out, or adjust the scene without them."
         )
     count, centers = scene.num_images, scene.cam_centers_in_world

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""From ray to pixel and back, each with its derivative: one file per family of camera models."""
+"""Camera models: projection, unprojection and their derivatives, one file per family."""
 
 # Models are numbered in the order of import. A new family goes to the end, so that loops compiled for the others stay.
 # isort: off

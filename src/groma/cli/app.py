@@ -37,19 +37,19 @@ app = typer.Typer(
 #: Name, function, and a few words for the list of ``groma --help``; the command's own help says the rest.
 _Commands = tuple[tuple[str, Callable[..., None], str], ...]
 _COMMANDS: _Commands = (
-    ("demo", demo.demo, "Map photographs that are shipped with groma: where to begin."),
-    ("map", map.map_, "Photographs to points, lines, planes and poses."),
-    ("track", track.track, "Follow a camera through a sequence, and map on the way."),
-    ("merge", merge.merge, "Two maps of one place become one."),
-    ("localize", localize.localize, "Where photographs were taken, in a map that is there already."),
+    ("demo", demo.demo, "Map the photographs included in groma: start here."),
+    ("map", map.map_, "Map photographs: points, lines, planes and poses."),
+    ("track", track.track, "Track a camera through a sequence and map the scene."),
+    ("merge", merge.merge, "Join two maps of one place."),
+    ("localize", localize.localize, "Localise photographs in an existing map."),
     ("adjust", adjust.adjust, "Bundle adjustment of a COLMAP model, BAL file or archive."),
-    ("align", align.align, "Into the frame of another scene, measured positions or control points."),
-    ("convert", convert.convert, "From one file format to another."),
-    ("report", report.report, "A scene as one HTML page that needs no network."),
-    ("view", view.view, "Look at a scene in the browser."),
-    ("synth", synth.synth, "A synthetic scene whose exact truth is known."),
+    ("align", align.align, "Align a scene with another scene, measured positions or control points."),
+    ("convert", convert.convert, "Convert between file formats."),
+    ("report", report.report, "Write a scene as one HTML page that needs no network."),
+    ("view", view.view, "View a scene in the browser."),
+    ("synth", synth.synth, "Generate a synthetic scene with exact ground truth."),
     ("selfcheck", selfcheck.selfcheck, "Check derivatives and covariances on this machine."),
-    ("warmup", warmup.warmup, "Compile everything once, so that no command waits for it."),
+    ("warmup", warmup.warmup, "Compile everything once, so that later commands start at once."),
 )
 _COMPARISONS: _Commands = (
     ("poses", evaluate.poses, "Camera poses of two scenes."),

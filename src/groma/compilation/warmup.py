@@ -42,7 +42,7 @@ def is_ready(part: str) -> bool:
 def warm_up(
     parts: Sequence[str] = PARTS, progress: Callable[[str, int, int], None] | None = None, again: bool = False
 ) -> dict[str, Any]:
-    """Compile and keep what adjusting, mapping and tracking need on this machine, as ``groma warmup`` does.
+    """Compile the kernels of adjustment, mapping and tracking for this machine, as ``groma warmup`` does.
 
     Parameters
     ----------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Results against references, in the scores of the field, with units."""
+"""Evaluation of results against references, in the scores of the field, with units."""
 
 from groma.evaluation.alignment import align_points, align_poses
 from groma.evaluation.lines import LineScores, evaluate_lines, score_lines

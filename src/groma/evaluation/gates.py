@@ -39,7 +39,7 @@ class ScoreGates:
     but_for_scale: float = gate(
         0.25,
         "share",
-        "of the position error is left with a scale: it is told",
+        "of the position error that remains with a free scale, below which a message says so",
         "convention: fifteen sixteenths of a sum of squares",
     )
     unrelated_deg: float = gate(

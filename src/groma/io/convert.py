@@ -17,18 +17,18 @@ def convert(source: str | os.PathLike[str], target: str | os.PathLike[str], forc
     source : path
         What :func:`groma.read_scene` reads.
     target : path
-        Its name says the format, as in :func:`groma.write_scene`. LIMAP's structures are kept.
+        Its name determines the format, as in :func:`groma.write_scene`. LIMAP's structures are kept.
     force : bool
         Replace what is there.
 
     Raises
     ------
     InputError
-        If there is nothing at ``source``, or the format cannot hold the scene.
+        If ``source`` does not exist, or the format cannot hold the scene.
     FileFormatError
         If ``source`` is not a scene, or damaged.
     OutputError
-        If something is at ``target`` already or the file system refuses.
+        If ``target`` exists already or cannot be written.
     """
     scene = read_scene(source)
     write_scene(scene, target, force=force, like=structures_of(source))

@@ -37,7 +37,7 @@ DepthMap = npt.NDArray[np.float32]
 
 @dataclass(frozen=True)
 class DepthMaps:
-    """A folder of depth maps, and what its numbers mean."""
+    """A folder of depth maps, and the unit of its values."""
 
     folder: Path
     #: Numbers in files per unit of length; None: 1000 for whole numbers (millimetres), 1 for others (metres).

@@ -28,7 +28,7 @@ HEAD_BYTES = 256
 
 @dataclass(frozen=True)
 class SceneFormat:
-    """How scenes are kept in files of one kind. What is None the format cannot do."""
+    """A scene file format. Operations that it does not support are None."""
 
     #: As ``format=`` spells it.
     name: str
@@ -83,7 +83,7 @@ def formats() -> tuple[SceneFormat, ...]:
 
 
 def read_scene(path: str | os.PathLike[str]) -> Scene:
-    """Read a scene: a COLMAP model, a groma archive, a BAL file or one of another program, told by its content.
+    """Read a scene: a COLMAP model, a groma archive, a BAL file or a file of another program, recognised by content.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
     Raises
     ------
     InputError
-        If there is nothing at ``path``.
+        If ``path`` does not exist.
     FileFormatError
         If it is none of these, or damaged.
     """
@@ -128,17 +128,17 @@ def write_scene(
     force: bool = False,
     like: Structures | None = None,
 ) -> None:
-    """Write a scene, whole or not at all.
+    """Write a scene atomically.
 
     Parameters
     ----------
     scene : Scene
         What to write.
     path : path
-        Where. With ``format="auto"`` the name says the format: ``.npz`` archive, ``.txt``, ``.bz2`` or ``.gz`` BAL,
-        ``.json`` cameras, poses and points for nerfstudio, ``.ply`` and ``.obj`` geometry only (points, lines, pieces
-        of planes), ``.glb``, ``.gltf``, ``.dxf`` and ``.rrd`` geometry and cameras, no suffix a COLMAP model in a new
-        folder.
+        Destination. With ``format="auto"`` the name determines the format: ``.npz`` archive, ``.txt``, ``.bz2`` or
+        ``.gz`` BAL, ``.json`` cameras, poses and points for nerfstudio, ``.ply`` and ``.obj`` geometry only (points,
+        lines, pieces of planes), ``.glb``, ``.gltf``, ``.dxf`` and ``.rrd`` geometry and cameras, no suffix a COLMAP
+        model in a new folder.
     format : str
         ``colmap``, ``colmap_text``, ``archive``, ``bal``, ``transforms``, ``ply``, ``obj``, ``gltf``, ``dxf``,
         ``rerun`` or a registered one, to override the name.
@@ -153,7 +153,7 @@ def write_scene(
     InputError
         If the format is unknown or cannot hold the scene.
     OutputError
-        If something is there already or the file system refuses.
+        If ``path`` exists already or cannot be written.
     """
     chosen = _FORMATS[check_target(scene, path, format)]
     assert chosen.write is not None

@@ -146,7 +146,7 @@ def write_trajectory(
     InputError
         If the format is unknown.
     OutputError
-        If something is there already or the file system refuses.
+        If ``path`` exists already or cannot be written.
     """
     if format not in _FORMATS:
         raise InputError(f"Unknown trajectory format {format!r}. Use {', '.join(_FORMATS)}.")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Where was this photograph taken: the pose of a camera in a map that is there already.
+"""Localisation: the pose of a camera in an existing map.
 
 What comes in is a map (a scene with its photographs, described once in :mod:`map_index`, with how wrong it
 is by :mod:`pose.map_errors`) and a photograph.

@@ -59,24 +59,24 @@ GATES = LocalizerGates()
 
 @dataclass(frozen=True)
 class LocalizeOptions:
-    """How photographs are localised."""
+    """Options of localisation."""
 
-    #: Use lines besides points.
+    #: Use lines in addition to points.
     lines: bool = True
-    #: Shortest segment, pixels.
+    #: Minimum segment length, pixels.
     min_segment_length: float = 15.0
-    #: Whether the poses and the calibrations of the map were estimated: their errors are in the covariance of each pose
-    #: then. None: as the summary of the map says; both where there is none.
+    #: Whether poses and calibrations of the map were estimated, so that the covariance of each pose includes their
+    #: errors. None: from the summary of the map; both where there is none.
     estimated: tuple[bool, bool] | None = None
-    #: Numbers of the retrieval.
+    #: Thresholds of image retrieval.
     gates: LocalizerGates = field(default_factory=LocalizerGates)
-    #: Of the poses: see there.
+    #: Options of the pose estimation.
     pose: PoseOptions = field(default_factory=PoseOptions)
 
 
 @dataclass(frozen=True, eq=False)
 class LocalizedImage:
-    """A photograph and where it was taken."""
+    """A localised photograph: its file, camera and pose."""
 
     pose: AbsolutePose
     #: Points and lines of the map that its matches show, as rows of the index and of the map.
@@ -91,18 +91,18 @@ _Found = tuple[AbsolutePose, Candidates]
 
 
 class Localizer:
-    """Places photographs in a map.
+    """Localises photographs in a map.
 
     Parameters
     ----------
     map_ : path or Scene
         OUT of ``groma map`` or ``groma track``, a COLMAP model, or a scene.
     images : path, optional
-        Folder of the photographs of the map, or a folder above. By default where they were when the map was described,
+        Folder of the photographs of the map, or a folder above. By default where they were when the map was indexed,
         or made.
     index : path, optional
-        File in which the descriptions of the map are kept, so that they are made once. By default beside the map; a
-        scene without a file is described anew.
+        File of the index of the map, which is made once. By default beside the map; a scene
+        without a file is indexed again.
     options : LocalizeOptions, optional
         Lines, retrieval, poses.
     progress : callable, optional
@@ -291,7 +291,7 @@ def _folder(map_: object, images: str | os.PathLike[str] | None, index: Path | N
         told = images_in_summary(Path(str(map_)))
     if told is None:
         name = "The scene" if isinstance(map_, Scene) else str(map_)
-        raise InputError(f"{name} does not tell where its photographs are. Pass their folder ({OPTIONS}).")
+        raise InputError(f"The folder of the photographs of {name} is unknown. Pass it ({OPTIONS}).")
     return told
 
 

@@ -347,7 +347,7 @@ def kept_index(
     try:
         index.write(path, digest, _common_folder(scene, files))
     except OutputError as error:
-        return index, f"The descriptions of the map cannot be kept, and are made again next time: {error}"
+        return index, f"The index of the map cannot be written and will be computed again: {error}"
     return index, ""
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""From photographs to a map of points, lines and planes.
+"""Mapping: from photographs to points, lines and planes.
 
 In come photographs and perhaps a model of points. Stages follow one another (``map.py``): segments
 (``image_segments.py``), lines (``lines``), the joint adjustment with weights from its residuals (``noise``), planes and

@@ -12,7 +12,7 @@ Stages, each saved when it is finished, so that an interrupted run goes on where
 4. ``joint``      poses, points and lines adjusted together, each point weighted by its own noise, the lines by theirs;
                   then the lines are mapped once more with the better poses, and all this again while that moves
                   the poses by more than the lines allow for;
-5. ``structure``  planes, common directions, and what lies on what, and how closely;
+5. ``structure``  planes, common directions and structural relations, with their deviations;
 6. ``adjusted``   everything adjusted together; observations that share errors with many others weigh less.
 """
 
@@ -106,7 +106,7 @@ def map_images(
     images : path
         Folder of photographs.
     work : path
-        Folder for finished stages. A second call with the same images, model and options goes on from them.
+        Folder for finished stages. A second call with the same images, model and options resumes from them.
     model : Scene, optional
         Poses, cameras and points of the images; reconstructed from the images if not given. Where it has no points,
         they are found, and the poses are measurements whose noise is estimated.
@@ -298,7 +298,7 @@ def adjust_jointly(scene: Scene, weighted: AdjustOptions, options: MapOptions, s
 
 @stage("structure", SCENE)
 def find_planes(scene: Scene, options: MapOptions, say: StageProgress) -> Scene:
-    """Planes, common directions, and what lies on what."""
+    """Planes, common directions and structural relations."""
     return find_structure(scene, options.structure, progress=say)
 
 

@@ -21,7 +21,7 @@ _STARTS: dict[Start, tuple[str, ...]] = {
     "model": (),
 }
 _LINES = ("proposing lines", "linking segments")
-_STRUCTURE = ("finding planes", "finding directions", "finding what lies on what")
+_STRUCTURE = ("finding planes", "finding directions", "finding relations")
 
 
 def planned_stages(

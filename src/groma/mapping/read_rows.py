@@ -76,7 +76,7 @@ def read_by_rows(scene: Scene, options: MapOptions, depth: object = None) -> boo
     """Tell whether photographs were read row by row: it was said, or the scene knows. Refuse depths beside it."""
     rolling = options.rolling_shutter is not None or len(scene.camera_motions) > 0
     if rolling and depth is not None:
-        raise InputError("Depths know no rolling shutter. Leave --depth or --rolling-shutter out.")
+        raise InputError("Depths do not support a rolling shutter. Leave --depth or --rolling-shutter out.")
     return rolling
 
 

@@ -51,7 +51,7 @@ SCENES_OF_RESULT = ("scene", "start", "before", "adjusted")
 
 @dataclass(frozen=True)
 class MapResult:
-    """The map and how it came about."""
+    """A map, and the report of how it was made."""
 
     #: Points, lines, planes, poses.
     scene: Scene
@@ -99,7 +99,7 @@ class MapResult:
         return pose_uncertainty(self.adjusted, problem, self.report.sigma0 or 1.0, by_landmarks=True)
 
     def contributions(self, reference: Scene | None = None) -> tuple[Contribution, ...]:
-        """Repeat the last adjustment by points alone, with lines, with planes: :func:`groma.contributions`."""
+        """Repeat the last adjustment with points only, with lines and with planes: :func:`groma.contributions`."""
         return contributions(self.before, self.adjusted_with, reference)
 
     def summary(self, diagnosis: Diagnosis | None = None, contributions: Sequence[Contribution] = ()) -> dict[str, Any]:

@@ -46,7 +46,7 @@ GATES = SurveyedGates()
 
 @dataclass(frozen=True, eq=False)
 class SurveyedResult:
-    """An adjustment with measurements of other instruments."""
+    """An adjustment with external measurements, and their reliability."""
 
     result: AdjustResult
     #: How the scene got into its frame, with the scene as it went in.
@@ -71,7 +71,7 @@ def adjust_surveyed(
     progress: Callable[[Progress], bool | None] | None = None,
     keep_suspects: bool = False,
 ) -> SurveyedResult:
-    """Bring a scene into the frame of measurements and adjust it with them.
+    """Transform a scene into the frame of external measurements and adjust it with them.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def adjust_surveyed(
     progress : callable, optional
         As for :func:`groma.adjust`.
     keep_suspects : bool, optional
-        Leave in what the test for gross errors would take out, and take back what it took out before.
+        Keep gross errors in the adjustment, also those that were taken out before.
 
     Raises
     ------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What is known about the world: arrays and identifiers, no algorithms."""
+"""Scenes: tables of arrays and identifiers, without algorithms."""
 
 from groma.scene.camera import Cameras, Rigs, Sensors
 from groma.scene.image import Frames, Images

@@ -80,7 +80,7 @@ class PlaneObservations(Table, noun="observation", optional=True):
 
 @dataclass(frozen=True, eq=False)
 class PosePriors(Table, noun="pose", optional=True):
-    """Poses of frames known beforehand: from other instruments, or predicted."""
+    """Prior poses of frames: from other instruments, or predicted."""
 
     #: (N,) the frame.
     frame_idx: IntArray = column(np.int64, refers="frames")

@@ -17,7 +17,7 @@ ROWS, COLUMNS = 0, 1
 
 @dataclass(frozen=True, eq=False)
 class CameraMotions(Table, noun="motion", optional=True):
-    """Images that were read row by row, and the motion of the camera meanwhile: uniform, along its own axes.
+    """Rolling-shutter images and the motion of the camera during readout: uniform, along its own axes.
 
     The pose of such an image is that of its middle row. Where the last row is read first, all numbers have the other
     sign; nothing else depends on the direction.

@@ -83,7 +83,7 @@ class LineObservations(Table, noun="observation"):
 
 @dataclass(frozen=True, eq=False)
 class Relations:
-    """Which landmarks belong together: (R, 2) pairs of indices, first and second landmark as the names say.
+    """Structural relations between landmarks: (R, 2) index pairs, first and second landmark as the names say.
 
     Each kind may have standard deviations, one for each pair: how far the first is off the second, in scene units;
     angles in radians. Where one is 0 it follows from the noise of the images (see

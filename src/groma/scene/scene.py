@@ -54,7 +54,7 @@ _IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Scene:
-    """Everything known about a scene; see the module."""
+    """A scene: tables of cameras, images, landmarks, observations and measurements."""
 
     #: Calibrations.
     cameras: Cameras = field(default_factory=Cameras)

@@ -76,7 +76,7 @@ def diagonal_covariance(sigma: npt.ArrayLike) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class CameraPositions(Table, noun="position", optional=True):
-    """Measured places of camera centres: GNSS, total stations, EXIF."""
+    """Measured positions of camera centres: GNSS, total stations, EXIF."""
 
     #: (N,) the image.
     image_idx: IntArray = column(np.int64, refers="images")
@@ -236,7 +236,7 @@ class CameraPoses(Table, noun="pose", optional=True):
 
 @dataclass(frozen=True, eq=False)
 class Held(Table, noun="held object", optional=True):
-    """Objects that keep the place they have: the cameras and landmarks of an earlier adjustment, a datum."""
+    """Objects held fixed: cameras and landmarks of an earlier adjustment, a datum."""
 
     #: (N,) kind of the object (:class:`Kind`), and which it is. Of an image its whole frame is held.
     kind: IntArray = column(np.int64, check=partial(check_kinds, allowed=tuple(Kind)))

@@ -17,34 +17,34 @@ SHARED_SYSTEMS = ("auto", "formed", "products")
 
 @dataclass(frozen=True)
 class SolverOptions:
-    """How a problem is solved. The defaults suit bundle adjustment."""
+    """Options of a solve. The defaults suit bundle adjustment."""
 
-    #: Most steps tried, accepted or not (cost: time; most end before).
+    #: Maximum number of steps, accepted or rejected (cost: time; most solves end before).
     max_iterations: int = 50
     #: Stop when the cost falls by less than this fraction in an accepted step.
     function_tolerance: float = 1e-6
-    #: Keep the start, as converged, when the first step promises to lower the cost by no more than this fraction.
+    #: Keep the start, as converged, when the predicted decrease of the first step is at most this fraction of the cost.
     start_tolerance: float = 0.0
     #: Stop when no component of the gradient, over the root of its diagonal in the normal equations, exceeds this.
     gradient_tolerance: float = 1e-10
-    #: Stop when the lengths in a step, its turns and all else are below this fraction of those of the states.
+    #: Stop when translations, rotations and all other parts of a step are below this fraction of those of the states.
     step_tolerance: float = 1e-10
-    #: ``levenberg_marquardt``, or ``gauss_newton`` for steps without damping: for problems that are well determined and
-    #: start near their minimum. Where the system is singular, or a step does not lower the cost, it stops.
+    #: ``levenberg_marquardt``, or ``gauss_newton`` for undamped steps: for well-determined problems that start near
+    #: their minimum. It stops if the system is singular or a step does not lower the cost.
     method: str = "levenberg_marquardt"
-    #: First damping, relative to the diagonal of the normal equations; None: 1e-4 where lines move, 1e-8 between poses
-    #: alone, else 1e-5.
+    #: Initial damping, relative to the diagonal of the normal equations; None: 1e-4 with free lines, 1e-8 for poses
+    #: only, else 1e-5.
     initial_damping: float | None = None
-    #: How the reduced system is solved: ``auto``, ``dense``, ``sparse``, ``pcg``, or a solver that was registered
+    #: Solver of the reduced system: ``auto``, ``dense``, ``sparse``, ``pcg``, or a registered one
     #: (:mod:`groma.solver.linear.contract`).
     linear_solver: str = "auto"
-    #: Where landmarks come in shards: ``formed``, every process holds the whole reduced system; ``products``, blocks
-    #: off its diagonal stay with their shards, and conjugate gradients sum products with them; ``auto``: products where
-    #: there are very many cameras (:data:`groma.solver.reduce.shards.MAX_FORMED`).
+    #: With shards of landmarks: ``formed``, every process holds the whole reduced system; ``products``, off-diagonal
+    #: blocks stay with their shards, and conjugate gradients sum products with them; ``auto``: products for very many
+    #: cameras (:data:`groma.solver.reduce.shards.MAX_FORMED`).
     shared_system: str = "auto"
-    #: Steps of every landmark on its own after each accepted joint step; a step that does not help is undone.
+    #: Separate steps of every landmark after each accepted joint step; a step that does not help is undone.
     landmark_steps: int = 0
-    #: The groups of landmarks that take them; None: all that are eliminated.
+    #: The groups of landmarks with separate steps; None: all that are eliminated.
     landmark_groups: tuple[str, ...] | None = None
     #: Groups of variables that are eliminated, or ``auto``.
     eliminate: str | tuple[str, ...] = "auto"

@@ -46,7 +46,7 @@ Progress = Callable[[Iteration], bool | None]
 
 @dataclass(frozen=True)
 class Solution:
-    """The problem at its new states, and how it got there."""
+    """The solved problem and the report of the solve."""
 
     problem: Problem
     report: SolveReport
@@ -67,7 +67,7 @@ def solve(
     Parameters
     ----------
     problem
-        Variables and factors; not changed.
+        Variables and factors; not modified.
     options
         How to solve; the defaults suit bundle adjustment.
     progress

@@ -20,7 +20,7 @@ ROUNDING = 1e-14
 
 
 class Termination(Enum):
-    """Reason for the end of a solve; ``sentence`` says it in words, with causes and remedies."""
+    """Why a solve stopped; ``sentence`` explains it, with causes and remedies."""
 
     COST_CONVERGED = (
         "cost_converged",

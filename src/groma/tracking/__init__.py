@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Track a camera through a sequence, and map points, lines and planes on the way.
+"""Track a camera through a sequence and map points, lines and planes.
 
 In come frames, one by one (:class:`Tracker`) or as a sequence (:func:`track`). Each frame gets a pose (``frame``,
 ``pose``); now and then one becomes a keyframe of a growing map (``map``), which is adjusted, closed in loops and joined

@@ -13,39 +13,39 @@ from groma.tracking.gates import TrackingGates
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """What is tracked, and when. The defaults suit hand-held cameras and cars at 10 frames a second and more."""
+    """Options of tracking. The defaults suit hand-held cameras and cars at 10 frames a second and more."""
 
-    #: Which landmarks take part.
+    #: Which landmarks are used.
     points: bool = True
     lines: bool = True
     planes: bool = True
-    #: Points followed at a time (cost: time).
+    #: Points tracked at a time (cost: time).
     num_points: int = 450
-    #: Features described in each keyframe, for finding the place again (cost: time).
+    #: Features described in each keyframe, for place recognition (cost: time).
     num_features: int = 1000
-    #: Lines followed at a time, the longest (cost: time).
+    #: Lines tracked at a time, the longest (cost: time).
     num_lines: int = 100
-    #: Shortest segment, pixels.
+    #: Minimum segment length, pixels.
     min_segment_length: float = 30.0
-    #: What finds the segments: an object, or a name of :data:`groma.features.registry.DETECTORS`.
+    #: Segment detector: an object, or a name of :data:`groma.features.registry.DETECTORS`.
     detector: str | SegmentDetector = "lsd"
     #: Depths beyond this are not used, scene units.
     max_depth: float = 6.0
-    #: Standard deviation of a followed point, pixels.
+    #: Standard deviation of a tracked point, pixels.
     point_sigma_px: float = 1.0
-    #: A keyframe is taken when fewer than this share of the points of the last one are still followed ...
+    #: A keyframe is made when fewer than this share of the points of the last one are still tracked ...
     keyframe_share: float = 0.6
     #: ... or the camera moved by this share of the median depth, or turned by this many radians.
     keyframe_motion: float = 0.12
     keyframe_turn: float = 0.2
-    #: Keyframes adjusted together after each new one; older ones that see the same are held (cost: time).
+    #: Keyframes adjusted together after each new one; older covisible ones are held (cost: time).
     window: int = 7
-    #: Look for places seen before, and close loops.
+    #: Recognise revisited places and close loops.
     close_loops: bool = True
     #: Use relations between landmarks that the data support: lines on planes, parallel and perpendicular planes.
     relations: bool = True
-    #: Work in several threads; the result is the same. A keyframe (not before 45 ms by the time stamps) and the
-    #: adjustment of its window are taken up two frames later, with threads or without.
+    #: Use several threads; the result is the same. A keyframe (not before 45 ms by the time stamps) and the
+    #: adjustment of its window are integrated two frames later, with threads or without.
     threaded: bool = True
     #: Tuned numbers: thresholds, with unit, meaning and origin.
     gates: TrackingGates = field(default_factory=TrackingGates)

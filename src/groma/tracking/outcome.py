@@ -46,7 +46,7 @@ class TrackedFrame:
 
 @dataclass(frozen=True)
 class TrackResult:
-    """Outcome of a track."""
+    """Result of a track: trajectory, map and warnings."""
 
     #: Poses of all frames that have one, world_from_cam; of the longest submap, if submaps could not be joined.
     trajectory: Trajectory

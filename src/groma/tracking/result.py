@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The map as a scene: keyframes as images, living landmarks, all measurements of them, and what lies on what."""
+"""The map as a scene: keyframes as images, active landmarks, all their measurements and relations."""
 
 from __future__ import annotations
 

@@ -151,12 +151,12 @@ def track(
     map_: str | os.PathLike[str] | None = None,
     source: FrameSource | None = None,
 ) -> SequenceResult:
-    """Track a camera through a sequence, and map points, lines and planes on the way.
+    """Track a camera through a sequence and map points, lines and planes.
 
     Parameters
     ----------
     sequence : Sequence or path
-        What :func:`groma.io.sequences.open_sequence` opened, or what it opens.
+        A sequence, or a path that :func:`groma.io.sequences.open_sequence` opens.
     options : TrackOptions, optional
         What is tracked, and when.
     progress : callable, optional
@@ -166,9 +166,10 @@ def track(
     name : str
         What the sequence is called in the summary; by default the path.
     map_ : path, optional
-        OUT of an earlier track: this one begins lost in it, goes on in its world once it finds itself, and adds to it.
+        OUT of an earlier track, whose map is used and extended: the track begins lost in it, and continues in its world
+        frame once relocalised.
     source : FrameSource, optional
-        Where the frames are, so that the result can be tracked in; by default the path.
+        Location of the frames, so that the result can be used as a map later; by default the path.
 
     Returns
     -------

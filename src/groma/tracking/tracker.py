@@ -67,7 +67,7 @@ class Tracker:
     camera, options
         The camera of all frames, free of distortion; see :class:`TrackOptions`.
     right_turn
-        How the right camera of a stereo pair is turned, if that is known from a track before.
+        Rotation of the right camera of a stereo pair, if known from an earlier track.
     saved
         The map of an earlier track (:func:`groma.tracking.map.saved_map.map_of_scene`): the track begins lost in it.
     """

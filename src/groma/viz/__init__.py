@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Pictures of scenes and solves. Imported only when asked for."""
+"""Visualisation of scenes and solves. Imported on demand."""

@@ -51,12 +51,12 @@ class PoseGraphOptions:
 
     #: ``none``, ``huber``, ``soft_l1``, ``cauchy``, ``tukey``, ``geman_mcclure``, ``barron`` or ``truncated``.
     loss: str = "none"
-    #: Where the loss begins to bend, in standard deviations; None: 4.1.
+    #: Residual at which the loss stops being quadratic, in standard deviations; None: 4.1.
     loss_scale: float | None = None
-    #: No loss for motions from one pose to the next (ids that follow each other): odometry errs a little all the time,
-    #: place recognition much now and then.
+    #: No robust loss for edges between consecutive ids: odometry has small errors everywhere, place recognition has
+    #: rare large ones.
     trust_odometry: bool = True
-    #: Most steps (cost: time; most end before).
+    #: Maximum number of steps (cost: time; most solves end before).
     max_iterations: int = 100
     #: ``auto``, ``dense``, ``sparse``, ``pcg``, or a solver that was registered.
     linear_solver: str = "auto"
@@ -66,7 +66,7 @@ class PoseGraphOptions:
 
 @dataclass(frozen=True)
 class PoseGraphResult:
-    """The adjusted graph, and how it got there."""
+    """The adjusted pose graph and the report."""
 
     graph: PoseGraph
     report: SolveReport
@@ -121,7 +121,7 @@ def adjust_pose_graph(
     options: PoseGraphOptions | None = None,
     progress: Callable[[Progress], bool | None] | None = None,
 ) -> PoseGraphResult:
-    """Adjust the poses of a graph; held ones stay, and the first of each connected part without one.
+    """Adjust the poses of a graph; in each connected component without a held pose, the first one is held.
 
     Parameters
     ----------

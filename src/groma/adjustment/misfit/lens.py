@@ -50,7 +50,7 @@ class LensGates:
     share: float = gate(
         0.1,
         "share",
-        "of the residuals' variance that distortion explains and that is told",
+        "of the residuals' variance explained by distortion, above which a warning says so",
         "convention: a tenth",
     )
     rings: int = gate(16, "rings", "of equal area around the principal point", "convention: as many as a histogram has")

@@ -38,7 +38,10 @@ class RigGates:
     """When residuals show that a rig does not fit."""
 
     share: float = gate(
-        0.1, "share", "of the residuals' variance that free cameras explain and that is told", "convention: a tenth"
+        0.1,
+        "share",
+        "of the residuals' variance explained by free cameras, above which a warning says so",
+        "convention: a tenth",
     )
     max_observations: int = gate(200_000, "observations", "that a rig is judged by", "cost: more tell no more")
     max_iterations: int = gate(10, "steps", "with free cameras", "cost: most need three")
@@ -83,7 +86,7 @@ def rig_that_does_not_fit(scene: Scene, problem: Problem, threads: int | None = 
         return None
     moved = _moved(sensors.state, freed.variables[SENSORS].state)
     return (
-        "The rig does not fit the images: with free places of its cameras the median residual of points would fall "
+        "The rig does not fit the images: with free poses of its cameras the median residual of points would fall "
         f"from {before:.2f} to {on_rig:.2f} px, and they would {moved}. "
         "Repeat with --refine-rig, or correct the rig file."
     )

@@ -42,7 +42,7 @@ def parts_of(folder: str | os.PathLike[str]) -> tuple[Path, ...]:
 def write_parts(
     scene: Scene, folder: str | os.PathLike[str], observations: int = PART_SIZE, force: bool = False
 ) -> tuple[Path, ...]:
-    """Cut a scene into parts with about so many observations each.
+    """Divide a scene into parts with about the given number of observations each.
 
     Landmarks are taken in the order of the first image that sees them, so that a part concerns few images; points that
     lie on lines are in the part of the first of these. Cameras, planes and directions are in all parts; a relation is

@@ -22,7 +22,7 @@ from groma.scene.checks import check_scene_given
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """A scene in another frame, and how well the two agree."""
+    """An aligned scene, and the residuals of the alignment."""
 
     scene: Scene
     #: ``new_from_old``.
@@ -60,20 +60,20 @@ class Alignment:
 
 
 def align(scene: Scene, reference: Scene | Survey) -> Alignment:
-    """Bring a scene into the frame of a reference by a robust similarity.
+    """Align a scene with a reference by a robust similarity.
 
     Parameters
     ----------
     scene : Scene
         In any frame.
     reference : Scene or Survey
-        A scene with images of the same names; where their centres do not tell the rotation the orientations take part.
+        A scene with images of the same names; orientations are used too if their centres do not determine the rotation.
         Or measured positions or control points; they are not added to the scene.
 
     Raises
     ------
     InputError
-        If less than three places are known in both frames, or these are mirror images of each other.
+        If fewer than three positions are known in both frames, or these are mirror images of each other.
     """
     check_scene_given(scene)
     check_scene_given(reference, "reference", Survey)
@@ -102,9 +102,11 @@ def _of_poses(source: FloatArray, target: FloatArray) -> tuple[Similarity, BoolA
             if "mirror" in str(error):
                 raise
     if inliers.sum() == 1:
-        raise InputError("Only one image is known in both frames, which does not tell the scale. Three are needed.")
+        raise InputError(
+            "Only one image is known in both frames, which does not determine the scale. Three are needed."
+        )
     found = pose_alignment(source[inliers], target[inliers])
-    words = "The camera centres alone do not tell the rotation well: the orientations took part."
+    words = "The camera centres alone do not determine the rotation well: orientations were used too."
     return found.similarity, inliers, (words,) if found.by_orientations else ()
 
 

@@ -10,7 +10,7 @@ from groma.io.survey import ControlFile, DirectionsFile, DistancesFile, Places, 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """Measurements as files hold them, and how they are meant."""
+    """External measurements as read from files, and their standard deviations."""
 
     #: Positions of cameras: :func:`groma.io.survey.read_positions`, :func:`groma.io.survey.read_exif_positions`.
     positions: Places | None = None
@@ -18,7 +18,7 @@ class Survey:
     control: ControlFile | None = None
     #: Distances between images, control points, points, lines and planes: :func:`groma.io.survey.read_distances`.
     distances: DistancesFile | None = None
-    #: What is on known planes, and known directions: :func:`groma.io.survey.read_known_planes`,
+    #: Objects on known planes, and known directions: :func:`groma.io.survey.read_known_planes`,
     #: :func:`groma.io.survey.read_directions`.
     planes: PlanesFile | None = None
     directions: DirectionsFile | None = None
@@ -35,9 +35,9 @@ class Survey:
     pose_sigma: tuple[float, ...] = ()
     #: Standard deviation of a coordinate of a mark, pixels.
     mark_sigma_px: float = 1.0
-    #: Names of control points that are kept back to check the result.
+    #: Names of control points held out as check points.
     check: tuple[str, ...] = ()
-    #: Names and patterns (``old/*``) of images, control points and landmarks that keep the place they have.
+    #: Names and patterns (``old/*``) of images, control points and landmarks to hold fixed.
     hold: tuple[str, ...] = ()
     #: ``enu``, ``utm`` or a system such as ``EPSG:32632``; None: that of the files.
     crs: str | None = None

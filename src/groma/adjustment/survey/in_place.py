@@ -86,8 +86,8 @@ def placing(before: Scene, scene: Scene, survey: Survey, frame: WorldFrame, note
     elif fit.on_line:
         fit = upright(fit, scene, target)
         notes.append(
-            "The measured places are on a line: they do not tell how the scene is turned about it. It was turned so "
-            "that the cameras stand upright."
+            "The measured positions are collinear, which leaves the rotation about their line undetermined. It was "
+            "chosen so that the cameras are upright."
         )
     check_directions(scene, fit.similarity.rotation)
     if len(far := np.flatnonzero(~fit.inliers)):

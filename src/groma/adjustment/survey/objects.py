@@ -153,7 +153,7 @@ def with_measured_points(scene: Scene, survey: Survey, notes: list[str]) -> Scen
 
 def distance_table(scene: Scene, given: DistancesFile, stated: float | None, notes: list[str]) -> Distances:
     """Return the table of distances; the larger kind of each pair is the second."""
-    sigma = _stated(given.sigma, stated, given.source, "its distances are", "--distance-sigma 0.001")
+    sigma = _stated(given.sigma, stated, given.source, "distances", "--distance-sigma 0.001")
     one, two = (find(names, scene, given.source, LOCATED) for names in (given.first, given.second))
     swap = one.kind > two.kind
     first = Found(np.where(swap, two.kind, one.kind), np.where(swap, two.idx, one.idx))
@@ -192,7 +192,7 @@ def _from_parallel(scene: Scene, kind: int, idx: int, other_kind: int, other_idx
 
 def plane_table(scene: Scene, given: PlanesFile, stated: float | None) -> KnownPlanes:
     """Return the table of known planes: one row for a camera or point, two for a line, three for a plane."""
-    sigma = _stated(given.sigma, stated, given.source, "its planes are known", "--plane-sigma 0.01")
+    sigma = _stated(given.sigma, stated, given.source, "known planes", "--plane-sigma 0.01")
     found = find(given.names, scene, given.source, LOCATED)
     rows, anchors = [], []
     for row, (kind, idx) in enumerate(zip(found.kind, found.idx, strict=True)):
@@ -209,7 +209,7 @@ def plane_table(scene: Scene, given: PlanesFile, stated: float | None) -> KnownP
 
 def direction_table(scene: Scene, given: DirectionsFile, stated: float | None, notes: list[str]) -> KnownDirections:
     """Return the table of known directions."""
-    sigma = _stated(given.sigma_deg, stated, given.source, "its directions are", "--direction-sigma 1 (degrees)")
+    sigma = _stated(given.sigma_deg, stated, given.source, "directions", "--direction-sigma 1 (degrees)")
     found = find(given.names, scene, given.source, DIRECTED, missing=True)
     known = found.idx >= 0
     if not known.any():
@@ -235,7 +235,7 @@ def pose_table(scene: Scene, given: PosesFile, stated: tuple[float, ...], notes:
     open_ = np.isnan(covariance).any(axis=(1, 2))
     if open_.any() and len(stated) != 2:
         raise InputError(
-            f"{given.source} does not say how exact its poses are. Say it: --pose-sigma 0.05,0.5 (position, degrees)."
+            f"{given.source} states no accuracy of its poses. Pass it: --pose-sigma 0.05,0.5 (position, degrees)."
         )
     if open_.any():
         covariance[open_] = np.diag([stated[0] ** 2] * 3 + [np.radians(stated[1]) ** 2] * 3)
@@ -266,7 +266,7 @@ def _stated(sigma: FloatArray, stated: float | None, source: str, what: str, opt
     """Return standard deviations as a file has them, else as stated."""
     found = np.where(np.isfinite(sigma), sigma, np.nan if stated is None else stated)
     if not np.isfinite(found).all():
-        raise InputError(f"{source} does not say how exact {what}. Say it: {option}.")
+        raise InputError(f"{source} states no accuracy of its {what}. Pass it: {option}.")
     return found
 
 

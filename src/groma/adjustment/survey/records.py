@@ -99,7 +99,7 @@ class CheckPoint:
 
 @dataclass(frozen=True)
 class Reliability:
-    """What an adjustment says of the measurements of other instruments than the cameras."""
+    """Reliability of external measurements in an adjustment: residuals, redundancy numbers and tests."""
 
     measurements: tuple[Measurement, ...]
     check_points: tuple[CheckPoint, ...]

@@ -81,16 +81,16 @@ _UNCHECKED = 1e-6
 def reliability(
     scene: Scene, problem: Problem | None = None, level: float = GATES.level, power: float = GATES.power
 ) -> Reliability | None:
-    """Say of each measurement of other instruments how well it is checked, and whether it is wrong.
+    """Compute the reliability of each external measurement: redundancy number, test and smallest detectable error.
 
     Parameters
     ----------
     scene : Scene
         An adjusted scene.
     problem : Problem, optional
-        The problem at its solution; made anew by default, at the noise stated in the scene.
+        The problem at its solution; by default assembled with the noise stated in the scene.
     level, power : float
-        Of the test for gross errors: its level, and the power with which it finds an error of the size told.
+        Level of the test for gross errors, and the power for which the smallest detectable error is computed.
 
     Returns
     -------

@@ -102,7 +102,7 @@ def sigma_of(given: Places, stated: tuple[float, ...], option: str, needed: Any 
     missing = ~np.isfinite(sigma).all(axis=1)
     if (missing & needed).any():
         raise InputError(
-            f"{given.source} does not say how exact its coordinates are. Say it: {option} 0.02, or horizontal and "
+            f"{given.source} states no accuracy of its coordinates. Pass it: {option} 0.02, or horizontal and "
             f"vertical: {option} 0.02,0.04 (units of the coordinates)."
         )
     sigma[missing] = 1.0

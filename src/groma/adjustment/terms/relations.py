@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Relations between landmarks as lengths and angles: what lies on what, and what runs along what."""
+"""Structural relations between landmarks, as lengths and angles."""
 
 from __future__ import annotations
 

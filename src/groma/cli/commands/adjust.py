@@ -35,7 +35,7 @@ def adjust(
         Path | None,
         _options.PLAIN.option(
             "Result: a folder (COLMAP model and structures), a groma archive (.npz) or a BAL file (.txt, .bz2, "
-            ".gz). Without it nothing but the report is written.",
+            ".gz). Without it, only reports are written.",
             "--output",
             "-o",
             metavar="OUT",
@@ -45,7 +45,7 @@ def adjust(
         str,
         _options.ADJUSTMENT.option(
             "auto, none, huber, soft_l1, cauchy, tukey, geman_mcclure, barron, truncated, or one of an installed "
-            "package. auto: robust (Cauchy, then Geman-McClure) for what comes from matching, none for BAL files.",
+            "package. auto: robust (Cauchy, then Geman-McClure) for matched features, none for BAL files.",
             choices=_complete.LOSSES,
             metavar="NAME",
         ),
@@ -59,8 +59,8 @@ def adjust(
     camera_model: Annotated[
         str | None,
         _options.CAMERAS.option(
-            "Change the lens model of all cameras first (PINHOLE to OPENCV, ...); what it adds starts at 0 and is"
-            " estimated.",
+            "Change the model of all cameras first (PINHOLE to OPENCV, ...); new parameters start at 0 and are "
+            "estimated.",
             choices=_complete.CAMERA_MODELS,
             metavar="NAME",
         ),
@@ -76,7 +76,7 @@ def adjust(
         bool, _options.CAMERAS.option("With the intrinsics: principal points too.", "--refine-principal-point")
     ] = False,
     refine_rigs: Annotated[
-        bool, _options.CAMERAS.option("Estimate where the cameras sit on their rig.", "--refine-rigs")
+        bool, _options.CAMERAS.option("Estimate the poses of the cameras on their rigs.", "--refine-rigs")
     ] = False,
     rolling_shutter: _options.RollingShutter = None,
     points: Annotated[bool, _options.ADJUSTMENT.option("Use points.")] = True,
@@ -89,7 +89,7 @@ def adjust(
     linear_solver: Annotated[
         str,
         _options.ADJUSTMENT.option(
-            "How each step is solved: auto, dense, sparse, pcg, or a solver of an installed package.",
+            "Linear solver: auto, dense, sparse, pcg, or one of an installed package.",
             choices=_complete.LINEAR_SOLVERS,
             metavar="NAME",
         ),
@@ -106,14 +106,14 @@ def adjust(
     line_residual: Annotated[
         LineResidual,
         _options.ADJUSTMENT.option(
-            "How segments are compared with lines: endpoints, distances in the image; bearing, angles of rays; "
-            "normal, the plane through camera and segment, also against the ray to the line's anchor."
+            "Residual of a segment: endpoints, distances in the image; bearing, angles of rays; normal, the plane "
+            "through camera and segment, also against the ray to the line's anchor."
         ),
     ] = "endpoints",
     plane_residual: Annotated[
         PlaneResidual,
         _options.ADJUSTMENT.option(
-            "How measured planes are compared: normal_offset, in the camera; quaternion, in the world."
+            "Residual of a measured plane: normal_offset, in the camera; quaternion, in the world."
         ),
     ] = "normal_offset",
     gauge: Annotated[
@@ -131,39 +131,37 @@ def adjust(
     covariance: Annotated[
         Path | None,
         _options.RESULTS.option(
-            "Also write how certain the result is: covariances (.npz) or standard deviations (.json) of images, "
-            "points, lines, planes and directions.",
+            "Also write the uncertainty: covariances (.npz) or standard deviations (.json) of images, points, lines, "
+            "planes and directions.",
             metavar="FILE",
         ),
     ] = None,
     covariance_gauge: Annotated[
         CovarianceGauge,
         _options.RESULTS.option(
-            "What it refers to: inner, all camera centres together; held, the first camera and the scale."
+            "Gauge of the covariances: inner, all camera centres; held, the first camera and the scale."
         ),
     ] = "auto",
     sigma0: Annotated[
         float,
         _options.RESULTS.option(
-            "With --covariance: the noise of the measurements in units of that stated (1 pixel unless the scene "
-            "says otherwise).",
+            "With --covariance: the measurement noise in units of the stated one (1 pixel unless the scene has "
+            "standard deviations).",
             metavar="S",
         ),
     ] = 1.0,
     diagnosis: Annotated[
-        bool | None, _options.RESULTS.option("Say what the data do not determine. Default: yes up to 300 images.")
+        bool | None, _options.RESULTS.option("Report what the data do not determine. Default: up to 300 images.")
     ] = None,
     keep: Annotated[
         Keep,
-        _options.ADJUSTMENT.option(
-            "With a folder of parts: keep them in memory from one step to the next; auto: where they fit."
-        ),
+        _options.ADJUSTMENT.option("With a folder of parts: keep them in memory between steps; auto: as many as fit."),
     ] = "auto",
     measured: _measured.Measured = _measured.NOTHING,
     protocol: Annotated[
         Path | None,
         _measured.PANEL.option(
-            "Also write the measurements with residuals, redundancy and tests, as text (adjustment.txt).",
+            "Also write measurements with residuals, redundancy numbers and tests, as text (adjustment.txt).",
             metavar="FILE",
         ),
     ] = None,
@@ -174,10 +172,10 @@ def adjust(
 ) -> None:
     """Adjust cameras, points, lines and planes together (bundle adjustment).
 
-    Reads a scene, minimises the robust reprojection error over everything in it and writes the scene back. The input
-    is never changed. LIMAP's structures beside a COLMAP model are read and written too, with what they hold besides.
-    What the data do not determine is said in words at the end. A pose graph (g2o, TORO) is adjusted, too, and so is a
-    folder of parts (groma convert --parts), by one process or by all that mpiexec starts.
+    Reads a scene, minimises the robust reprojection error and writes the scene back. The input is never modified.
+    LIMAP's structures beside a COLMAP model are read and written too. A diagnosis at the end reports what the data do
+    not determine. Pose graphs (g2o, TORO) can be adjusted too, and so can a folder of parts (groma convert --parts), in
+    one process or in those started by mpiexec.
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.adjusting import Wanted, adjust_and_write

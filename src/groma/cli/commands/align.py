@@ -26,7 +26,7 @@ def align(
         typer.Argument(metavar="REFERENCE", help="A scene with images of the same names, of any format."),
     ] = None,
     output: Annotated[
-        Path | None, _options.PLAIN.option("Folder or file for the moved scene.", "--output", "-o", metavar="OUT")
+        Path | None, _options.PLAIN.option("Folder or file for the aligned scene.", "--output", "-o", metavar="OUT")
     ] = None,
     positions: _measured.Positions = None,
     control: _measured.Control = None,
@@ -34,10 +34,10 @@ def align(
     force: _options.Force = False,
     seed: _options.NoSeed = 0,
 ) -> None:
-    """Bring a scene into the frame of a reference by a similarity, which ignores gross errors.
+    """Align a scene with a reference by a robust similarity.
 
-    The reference is another scene, measured camera positions or control points. Nothing is adjusted: for measurements
-    that take part in an adjustment, pass them to groma adjust or groma map.
+    The reference is another scene, measured camera positions or control points. Nothing is adjusted: to use
+    measurements in an adjustment, pass them to groma adjust or groma map.
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.input import check_inputs

@@ -24,25 +24,24 @@ def convert(
         Path,
         typer.Argument(
             metavar="OUTPUT",
-            help="Its name says the format: a folder for a COLMAP model, .npz for a groma archive, .txt, .bz2 or .gz "
-            "for BAL, .json for nerfstudio and instant-ngp: cameras, poses and points. To look at: .ply, .obj: points, "
-            "lines and pieces of planes; .glb, .gltf, .dxf or .rrd (rerun): these and cameras.",
+            help="Its name determines the format: a folder for a COLMAP model, .npz for a groma archive, .txt, .bz2 or "
+            ".gz for BAL, .json for nerfstudio and instant-ngp (cameras, poses and points). For viewing: .ply, .obj "
+            "(points, lines and planes); .glb, .gltf, .dxf or .rrd (rerun) with cameras.",
         ),
     ],
     parts: Annotated[
         bool,
         _options.PLAIN.option(
-            "Cut the scene into parts in the folder OUTPUT, which groma adjust adjusts one by one, or by many "
-            "processes together.",
+            "Divide the scene into parts in the folder OUTPUT, for groma adjust in one process or many.",
             "--parts",
         ),
     ] = False,
     part_size: Annotated[
-        int | None, _options.PLAIN.option("With --parts: observations of a part. Default: 1000000.", min=1, metavar="N")
+        int | None, _options.PLAIN.option("With --parts: observations per part. Default: 1000000.", min=1, metavar="N")
     ] = None,
     force: _options.Force = False,
 ) -> None:
-    """Read a scene and write it in another format, or cut it into parts; a folder of parts is joined to one scene."""
+    """Convert a scene to another format, or divide it into parts; a folder of parts is joined to one scene."""
     if part_size is not None and not parts:
         raise InputError("--part-size is the size of parts. Add --parts, or leave it out.")
     _output.check_outputs(force, None if parts and force else target, json_target=console.json_target)

@@ -21,9 +21,9 @@ def demo(
 ) -> None:
     """Map 58 real photographs of a filing cabinet: points, lines and planes, adjusted together.
 
-    The start is a COLMAP model with points alone. The folder then holds report.html (open it in a browser), a COLMAP
-    model with the lines and planes beside it (structures/), scene.npz, lines.obj and summary.json, as after groma map.
-    The result is compared with poses by motion capture and with the size of the cabinet.
+    It starts from a point-only COLMAP model. The folder will hold report.html (open it in a browser), a COLMAP model
+    with lines and planes (structures/), scene.npz, lines.obj and summary.json, as with groma map. The result is
+    compared with motion capture and with the dimensions of the cabinet.
     """
     replace, output = force or output is None, output or Path("groma_demo")
     _output.check_outputs(replace, output)

@@ -21,8 +21,8 @@ _StepUnit = Literal["frames", "metres", "seconds"]
 
 def poses(
     console: Console,
-    estimate: Annotated[Path, typer.Argument(metavar="EST", help="Scene to judge.")],
-    reference: Annotated[Path, typer.Argument(metavar="REF", help="Scene taken for true.")],
+    estimate: Annotated[Path, typer.Argument(metavar="EST", help="Scene to evaluate.")],
+    reference: Annotated[Path, typer.Argument(metavar="REF", help="Reference scene.")],
     force: _options.ForceReport = False,
 ) -> None:
     """Compare the camera poses of two scenes after similarity alignment; images are matched by name."""
@@ -67,12 +67,12 @@ _Thresholds = Annotated[
 
 def lines(
     console: Console,
-    estimate: Annotated[Path, typer.Argument(metavar="EST", help="Scene or line set to judge.")],
+    estimate: Annotated[Path, typer.Argument(metavar="EST", help="Scene or line set to evaluate.")],
     reference: Annotated[
         Path | None,
         typer.Argument(
             metavar="REF",
-            help="Scene, line set or edge graph (.npz, .npy, .txt), mesh (.ply, .obj) or points taken for true.",
+            help="Scene, line set or edge graph (.npz, .npy, .txt), mesh (.ply, .obj) or points as reference.",
             show_default=False,
         ),
     ] = None,
@@ -80,7 +80,7 @@ def lines(
     silhouettes: Annotated[
         Path | None,
         _options.PLAIN.option(
-            "Masks of the object, named like the images of EST: how far lines leave them. REF is then optional.",
+            "Masks of the object, named like the images of EST: report how far lines leave them. REF is then optional.",
             metavar="FOLDER",
         ),
     ] = None,
@@ -89,10 +89,9 @@ def lines(
     ] = False,
     force: _options.ForceReport = False,
 ) -> None:
-    """Compare 3D line segments with a reference: how much of it is covered, how much of the lines is right.
+    """Compare 3D line segments with a reference: recall and precision.
 
-    With --silhouettes also, or only, with the silhouettes of the object, into which a true line projects from
-    everywhere.
+    With --silhouettes also, or only, with the silhouettes of the object: a true line projects into them in every view.
     """
     _output.check_json(console.json_target, force)
     check_inputs(estimate, reference, silhouettes)
@@ -155,10 +154,10 @@ def _compare_silhouettes(console: Console, estimate: Path, folder: Path) -> dict
 
 def planes(
     console: Console,
-    estimate: Annotated[Path, typer.Argument(metavar="EST", help="Scene to judge.")],
+    estimate: Annotated[Path, typer.Argument(metavar="EST", help="Scene to evaluate.")],
     reference: Annotated[
         Path,
-        typer.Argument(metavar="REF", help="Scene with planes, or points (.ply, .obj, .npy, .npz) taken for true."),
+        typer.Argument(metavar="REF", help="Reference: scene with planes, or points (.ply, .obj, .npy, .npz)."),
     ],
     threshold: _Thresholds = None,
     max_angle: Annotated[
@@ -208,8 +207,8 @@ def planes(
 
 def trajectory(
     console: Console,
-    estimate: Annotated[Path, typer.Argument(metavar="EST", help="Trajectory to judge.")],
-    reference: Annotated[Path, typer.Argument(metavar="REF", help="Trajectory taken for true.")],
+    estimate: Annotated[Path, typer.Argument(metavar="EST", help="Trajectory to evaluate.")],
+    reference: Annotated[Path, typer.Argument(metavar="REF", help="Reference trajectory.")],
     format: Annotated[_Format, _options.PLAIN.option("Format of both files; .gz is unpacked.")] = "auto",
     align: Annotated[_Alignment, _options.PLAIN.option("Alignment of EST to REF; sim3 for monocular.")] = "se3",
     max_time_difference: Annotated[

@@ -32,13 +32,13 @@ def localize(
     images: Annotated[
         Path | None,
         _options.PLAIN.option(
-            "The photographs of the map. Needed unless an earlier run described the map.", metavar="FOLDER"
+            "Folder of the photographs of the map; needed unless an earlier run indexed the map.", metavar="FOLDER"
         ),
     ] = None,
     calibration: Annotated[
         str,
         _options.PLAIN.option(
-            "Of the queries: map, exif, unknown; or auto, the first of these that fits.",
+            "Calibration of the queries: map, exif, unknown; or auto, the first of these that applies.",
             choices=_complete.CALIBRATIONS,
             metavar="SOURCE",
         ),
@@ -46,28 +46,28 @@ def localize(
     camera_model: Annotated[
         str | None,
         _options.PLAIN.option(
-            "Lens model of the queries, by COLMAP's name; with its parameters.",
+            "Camera model of the queries, COLMAP's name; with --camera-params.",
             choices=_complete.CAMERA_MODELS,
             metavar="NAME",
         ),
     ] = None,
     camera_params: Annotated[
         str | None,
-        _options.PLAIN.option("The parameters, if they are known; they are then kept.", metavar="F,CX,CY,..."),
+        _options.PLAIN.option("Known camera parameters of the queries, which are held.", metavar="F,CX,CY,..."),
     ] = None,
-    lines: Annotated[bool, _options.PLAIN.option("Use lines besides points.")] = True,
+    lines: Annotated[bool, _options.PLAIN.option("Use lines in addition to points.")] = True,
     min_length: Annotated[
-        float, _options.PLAIN.option("Shortest line segment, pixels.", min=5.0, metavar="PX")
+        float, _options.PLAIN.option("Minimum length of line segments, pixels.", min=5.0, metavar="PX")
     ] = _MIN_LENGTH,
     force: _options.Force = False,
     seed: _options.Seed = 0,
 ) -> None:
     """Localise photographs in a map.
 
-    OUT then holds poses.txt (name qw qx qy qz tx ty tz of what was localised), localized.json (status, pose,
-    uncertainty and a sentence for every query), a COLMAP model of the map with the queries in it, the lines in
-    structures/, and report.html. The map is described once; the descriptions are kept beside it (MAP.index.npz).
-    Finished queries are kept in OUT.work until the end: after an interruption the same command goes on from there.
+    OUT will hold poses.txt (name qw qx qy qz tx ty tz of localised queries), localized.json (status, pose, uncertainty
+    and a sentence for every query), a COLMAP model of the map with the queries in it, the lines in structures/, and
+    report.html. The map is indexed once; the index is kept beside it (MAP.index.npz). Finished queries are kept in
+    OUT.work until the end: after an interruption the same command resumes there.
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.input import camera_parameters, check_inputs, refuse_idle
@@ -100,7 +100,7 @@ def localize(
             localizer = Localizer(map_, images, options=options, progress=say)
             found = localize_images(localizer, files, work, choice, say)
     except KeyboardInterrupt:
-        words = f"finished queries are kept in {work}: the same command goes on from there."
+        words = f"finished queries are kept in {work}: the same command resumes there."
         raise typer.Exit(PROCESS.tell(words)) from None
     if localizer.warning:
         console.warn(localizer.warning)

@@ -29,49 +29,46 @@ def map_(
     model: Annotated[
         Path | None,
         _options.CAMERAS.option(
-            "Poses, cameras and points: a COLMAP model, an archive (.npz) or the OUT of a map. Without it they "
-            "are reconstructed.",
+            "Poses, cameras and points: a COLMAP model, an archive (.npz) or the OUT of a map. Default: reconstruct "
+            "them.",
             metavar="MODEL",
         ),
     ] = None,
     poses: Annotated[
         Path | None,
         _options.CAMERAS.option(
-            "Poses from elsewhere, without points: a model, transforms.json, reconstruction.json, a trajectory "
-            "(TUM, KITTI), a g2o graph, or name x y z qx qy qz qw. Points are found, poses improved, wrong ones "
-            "named.",
+            "Poses without points: a model, transforms.json, reconstruction.json, a trajectory (TUM, KITTI), a g2o "
+            "graph, or lines name x y z qx qy qz qw. Points are triangulated, poses refined, wrong ones reported.",
             metavar="FILE",
         ),
     ] = None,
     extend: Annotated[
         Path | None,
         _options.CAMERAS.option(
-            "Place the photographs in this map, OUT of groma map or a COLMAP model, and map all of both.", metavar="MAP"
+            "Add the photographs to this map (OUT of groma map, or a COLMAP model), and map all of both.", metavar="MAP"
         ),
     ] = None,
     map_images: Annotated[
         Path | None,
-        _options.CAMERAS.option("With --extend: the photographs of MAP, if they are not found.", metavar="FOLDER"),
+        _options.CAMERAS.option("With --extend: folder of the photographs of MAP, if unknown.", metavar="FOLDER"),
     ] = None,
     camera_model: Annotated[
         str | None,
         _options.CAMERAS.option(
-            "Lens model, COLMAP's name. Without --model the one to estimate (SIMPLE_RADIAL, if need be RADIAL); with "
-            "it the one that its cameras are changed to, and what it adds is estimated.",
+            "Camera model, COLMAP's name. Without --model: the model to estimate (SIMPLE_RADIAL, or RADIAL if needed); "
+            "with it: the model that its cameras are changed to, whose new parameters are estimated.",
             choices=_complete.CAMERA_MODELS,
             metavar="NAME",
         ),
     ] = None,
     camera_params: Annotated[
         str | None,
-        _options.CAMERAS.option(
-            "Without --model: the calibration, if it is known; it is then kept.", metavar="F,CX,CY,..."
-        ),
+        _options.CAMERAS.option("Without --model: a known calibration, which is held.", metavar="F,CX,CY,..."),
     ] = None,
     mapper: Annotated[
         str,
         _options.CAMERAS.option(
-            "Without --model and --poses: place cameras incremental(ly) or global(ly).",
+            "Without --model and --poses: incremental or global structure from motion.",
             choices=_complete.MAPPERS,
             metavar="NAME",
         ),
@@ -79,37 +76,37 @@ def map_(
     rig: Annotated[
         Path | None,
         _options.CAMERAS.option(
-            "Images taken at the same moment by cameras fixed to each other: COLMAP's rig_config.json. Found by "
-            "itself in IMAGES.",
+            "Rig of cameras that are rigidly mounted and triggered together: COLMAP's rig_config.json. Default: the "
+            "one in IMAGES, if any.",
             metavar="FILE",
         ),
     ] = None,
     refine_rig: Annotated[
-        bool, _options.CAMERAS.option("Estimate where the cameras sit on their rig.", "--refine-rig/--fix-rig")
+        bool, _options.CAMERAS.option("Estimate the poses of the cameras on the rig.", "--refine-rig/--fix-rig")
     ] = False,
     rolling_shutter: _options.RollingShutter = None,
     line_matches: Annotated[
         Path | None,
         _options.LANDMARKS.option(
-            "Segments and their matches from elsewhere; the documentation has the layout.", metavar="NPZ"
+            "External segments and matches; the documentation describes the layout.", metavar="NPZ"
         ),
     ] = None,
     line_detector: _options.LineDetector = "lsd",
     line_matcher: Annotated[
         str | None,
         _options.LANDMARKS.option(
-            "Match segments by wide_baseline, flow, or a matcher of an installed package. Default: poses alone.",
+            "Segment matcher: wide_baseline, flow, or one of an installed package. Default: epipolar geometry only.",
             choices=_complete.MATCHERS,
             metavar="NAME",
         ),
     ] = None,
     min_length: Annotated[
-        float, _options.LANDMARKS.option("Shortest line segment, pixels.", min=5.0, metavar="PX")
+        float, _options.LANDMARKS.option("Minimum length of line segments, pixels.", min=5.0, metavar="PX")
     ] = 12.0,
     cluster_size: Annotated[
         int,
         _options.LANDMARKS.option(
-            "Map the lines of more images than this in clusters of at most N, joined across borders; 0: all at once.",
+            "Map lines of more than N images in clusters of at most N, joined across borders; 0: all at once.",
             min=0,
             metavar="N",
         ),
@@ -117,12 +114,12 @@ def map_(
     min_confidence: Annotated[
         float,
         _options.LANDMARKS.option(
-            "Leave out lines less probably right than this; 0 keeps all.", min=0.0, max=1.0, metavar="P"
+            "Minimum probability of a line being right; 0 keeps all.", min=0.0, max=1.0, metavar="P"
         ),
     ] = 0.5,
-    planes: Annotated[bool, _options.LANDMARKS.option("Look for planes and directions.")] = True,
+    planes: Annotated[bool, _options.LANDMARKS.option("Find planes and directions.")] = True,
     refine_poses: Annotated[
-        bool, _options.ADJUSTMENT.option("Move the cameras too, or the landmarks alone.", "--refine-poses/--fix-poses")
+        bool, _options.ADJUSTMENT.option("Estimate camera poses, or hold them.", "--refine-poses/--fix-poses")
     ] = True,
     refine_intrinsics: Annotated[
         bool | None,
@@ -137,11 +134,11 @@ def map_(
     refine_points: Annotated[
         bool,
         _options.ADJUSTMENT.option(
-            "Measure the points of the model again in the images.", "--refine-points/--keep-points"
+            "Refine the point measurements of the model in the images.", "--refine-points/--keep-points"
         ),
     ] = False,
     diagnosis: Annotated[
-        bool | None, _options.ADJUSTMENT.option("Say what the data do not determine. Default: yes up to 300 images.")
+        bool | None, _options.ADJUSTMENT.option("Report what the data do not determine. Default: up to 300 images.")
     ] = None,
     measured: _measured.Measured = _measured.NOTHING,
     depth: _depth.Depth = None,
@@ -154,9 +151,9 @@ def map_(
 ) -> None:
     """Map photographs: points, lines and planes, adjusted together.
 
-    OUT then holds a COLMAP model with the lines and planes beside it (structures/), scene.npz, lines and planes as PLY
-    and OBJ, summary.json and report.html; with measurements adjustment.txt. Finished stages are kept in OUT.work until
-    the end: after an interruption the same command goes on from there.
+    OUT will hold a COLMAP model with lines and planes (structures/), scene.npz, lines and planes as PLY and OBJ,
+    summary.json and report.html; with measurements adjustment.txt. Finished stages are kept in OUT.work until the end:
+    after an interruption the same command resumes there.
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.extending import check_extension

@@ -15,25 +15,25 @@ from groma.cli.shared.console import Console
 def merge(
     console: Console,
     first: Annotated[Path, typer.Argument(metavar="A", help="OUT of groma map, or a COLMAP model.")],
-    second: Annotated[Path, typer.Argument(metavar="B", help="Another one, of a place that overlaps.")],
+    second: Annotated[Path, typer.Argument(metavar="B", help="A second map, of an overlapping place.")],
     output: Annotated[Path, _options.PLAIN.option("Folder for the results.", "--output", "-o", metavar="OUT")],
     first_images: Annotated[
         Path | None,
-        _options.PLAIN.option("The photographs of A, if they are not found.", "--images-a", metavar="FOLDER"),
+        _options.PLAIN.option("Folder of the photographs of A, if unknown.", "--images-a", metavar="FOLDER"),
     ] = None,
     second_images: Annotated[
         Path | None,
-        _options.PLAIN.option("The photographs of B, if they are not found.", "--images-b", metavar="FOLDER"),
+        _options.PLAIN.option("Folder of the photographs of B, if unknown.", "--images-b", metavar="FOLDER"),
     ] = None,
-    scale: Annotated[bool, _options.PLAIN.option("B may have another scale; without, both have the same.")] = True,
+    scale: Annotated[bool, _options.PLAIN.option("Estimate the scale of B, or assume that of A.")] = True,
     force: _options.Force = False,
     seed: _options.Seed = 0,
 ) -> None:
     """Join two maps of one place.
 
-    Photographs of B are localised in A, which matches points and lines of both; these give the motion between the two
-    worlds. All photographs are then mapped together, in the world of A; lines of both maps that are not found anew are
-    kept. OUT is that of groma map; OUT.images holds links to the photographs of both.
+    Photographs of B are localised in A, which matches points and lines of both; from these the transformation between
+    the two world frames is estimated. All photographs are then mapped together, in the world of A; lines of either map
+    that are not found again are kept. OUT is as with groma map; OUT.images holds links to the photographs of both.
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.input import check_inputs

@@ -15,7 +15,7 @@ def report(
         "report.html"
     ),
     images: Annotated[
-        Path | None, _options.PLAIN.option("Folder of the photographs, with what was measured in them.", metavar="DIR")
+        Path | None, _options.PLAIN.option("Folder of the photographs, shown with their measurements.", metavar="DIR")
     ] = None,
     before: Annotated[
         Path | None, _options.PLAIN.option("The same scene before adjustment, to compare with.", metavar="SCENE")
@@ -23,8 +23,8 @@ def report(
     covariance: Annotated[
         Path | None,
         _options.PLAIN.option(
-            "Arrays of groma adjust --covariance FILE.npz: lengths and angles measured on the page get standard "
-            "deviations.",
+            "File of groma adjust --covariance FILE.npz: adds standard deviations to lengths and angles measured on "
+            "the page.",
             metavar="FILE",
         ),
     ] = None,
@@ -32,7 +32,7 @@ def report(
 ) -> None:
     """Write a self-contained HTML page of a scene: 3D view, photographs, residuals, numbers. It needs no network.
 
-    For the folder of a finished map the page also says how the adjustment went and what became of the segments.
+    For the folder of a finished map the page also shows convergence and the rejection reasons of segments.
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.input import check_inputs, whole_scene

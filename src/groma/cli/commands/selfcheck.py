@@ -29,13 +29,9 @@ def selfcheck(
     ] = None,
     nees: Annotated[
         bool,
-        _options.PLAIN.option(
-            "Check covariances instead: errors of simulated scenes against what they predict.", "--nees"
-        ),
+        _options.PLAIN.option("Check covariances instead, against errors of simulated scenes.", "--nees"),
     ] = False,
-    runs: Annotated[
-        int, _options.PLAIN.option("Scenes simulated with --nees, for either gauge.", min=2, metavar="N")
-    ] = _RUNS,
+    runs: Annotated[int, _options.PLAIN.option("With --nees: simulated scenes per gauge.", min=2, metavar="N")] = _RUNS,
     seed: _options.Seed = 0,
     force: _options.ForceReport = False,
 ) -> None:
@@ -43,7 +39,7 @@ def selfcheck(
 
     Prints the worst deviation per factor, with --verbose per block. With --nees, simulates scenes of known noise and
     prints how the errors of poses, points, lines, planes, directions and intrinsics compare with their covariances.
-    Exit code 1 if something is too large.
+    Exit code 1 if a deviation is too large.
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.input import refuse_idle

@@ -20,7 +20,7 @@ def synth(
     kind: Annotated[
         Kind,
         _options.PLAIN.option(
-            "holistic: cameras on a sphere look into a cube of points, lines, planes. corridor: a walk."
+            "holistic: cameras on a sphere around a cube of points, lines and planes. corridor: a walk."
         ),
     ] = "holistic",
     cameras: Annotated[
@@ -35,10 +35,10 @@ def synth(
     seed: _options.Seed = 0,
     force: _options.Force = False,
 ) -> None:
-    """Make a scene of points, lines and planes whose exact truth is known.
+    """Generate a synthetic scene of points, lines and planes with exact ground truth.
 
     truth.npz holds the exact scene with noisy measurements; start.npz the same scene with perturbed cameras and
-    landmarks, as an adjustment would meet it.
+    landmarks, as the start of an adjustment.
     """
     from groma.cli.shared import output as _output
 

@@ -25,60 +25,58 @@ def track(
     output: Annotated[Path, _options.PLAIN.option("Folder for the results.", "--output", "-o", metavar="OUT")],
     map_: Annotated[
         Path | None,
-        _options.PLAIN.option(
-            "OUT of an earlier track: begin lost in it, go on in its world, and add to it.", "--map", metavar="MAP"
-        ),
+        _options.PLAIN.option("OUT of an earlier track: relocalise in its map, and extend it.", "--map", metavar="MAP"),
     ] = None,
     camera: Annotated[
         str | None,
         _options.CAMERAS.option(
-            "Calibration file, or its numbers as OpenCV has them: fx fy cx cy [k1 k2 p1 p2 [k3]]. Default: what "
-            "the sequence says.",
+            "Calibration file, or parameters in OpenCV's order: fx fy cx cy [k1 k2 p1 p2 [k3]]. Default: that of the "
+            "sequence.",
             metavar="CAMERA",
         ),
     ] = None,
     camera_model: Annotated[
         str | None,
         _options.CAMERAS.option(
-            "Lens model, by COLMAP's name; with its parameters, in place of --camera.",
+            "Camera model, COLMAP's name; with --camera-params, instead of --camera.",
             choices=_complete.CAMERA_MODELS,
             metavar="NAME",
         ),
     ] = None,
     camera_params: Annotated[
         str | None,
-        _options.CAMERAS.option("The parameters, in COLMAP's order and pixel coordinates.", metavar="F,CX,CY,..."),
+        _options.CAMERAS.option("Camera parameters, in COLMAP's order and pixel coordinates.", metavar="F,CX,CY,..."),
     ] = None,
     kind: Annotated[
         str | None,
         _options.CAMERAS.option(
-            "rgbd, stereo or mono; told by the files otherwise.", choices=_complete.SEQUENCES, metavar="KIND"
+            "rgbd, stereo or mono. Default: recognised by the files.", choices=_complete.SEQUENCES, metavar="KIND"
         ),
     ] = None,
-    points: Annotated[bool, _options.LANDMARKS.option("Follow points.")] = True,
-    lines: Annotated[bool, _options.LANDMARKS.option("Follow line segments.")] = True,
+    points: Annotated[bool, _options.LANDMARKS.option("Track points.")] = True,
+    lines: Annotated[bool, _options.LANDMARKS.option("Track line segments.")] = True,
     line_detector: _options.LineDetector = "lsd",
     planes: Annotated[bool, _options.LANDMARKS.option("Find planes in depth images, or in points and lines.")] = True,
     loops: Annotated[bool, _options.PLAIN.option("Close loops.")] = True,
     max_frames: Annotated[
         int | None, _options.PLAIN.option("Stop after N frames. Default: all.", min=1, metavar="N")
     ] = None,
-    stride: Annotated[int, _options.PLAIN.option("Take every N-th frame.", min=1, metavar="N")] = 1,
-    max_depth: Annotated[float, _options.PLAIN.option("Ignore depths beyond, metres.", min=0.1, metavar="M")] = 6.0,
+    stride: Annotated[int, _options.PLAIN.option("Use every N-th frame.", min=1, metavar="N")] = 1,
+    max_depth: Annotated[float, _options.PLAIN.option("Ignore depths beyond M metres.", min=0.1, metavar="M")] = 6.0,
     depth_scale: Annotated[
         float | None,
         _options.PLAIN.option(
-            "Depth in files per metre. Default: that of the layout (TUM 5000, else 1000).", metavar="S"
+            "Depth values per metre. Default: that of the layout (TUM 5000, else 1000).", metavar="S"
         ),
     ] = None,
     force: _options.Force = False,
 ) -> None:
     """Track a camera through a sequence.
 
-    OUT then holds trajectory.txt (TUM format), the keyframes as a COLMAP model with lines and planes beside it
-    (structures/), scene.npz, summary.json and report.html. While it runs, OUT.work holds the keyframes that are
-    finished (groma view --live OUT shows them); Ctrl-C ends the track early and writes what there is. Where the track
-    was lost for long and no place was recognised later, further maps are in OUT/submap_2, submap_3, ...
+    OUT will hold trajectory.txt (TUM format), the keyframes as a COLMAP model with lines and planes (structures/),
+    scene.npz, summary.json and report.html. While it runs, OUT.work holds the finished keyframes (groma view --live OUT
+    shows them); Ctrl-C ends the track early and writes the result so far. Submaps that could not be merged after a
+    loss are in OUT/submap_2, submap_3, ...
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.input import camera_line, refuse_idle

@@ -12,11 +12,11 @@ from groma.cli.shared.console import Console
 
 def view(
     console: Console,
-    source: Annotated[Path, typer.Argument(metavar="INPUT", help="Model to look at; with --live the OUT of a track.")],
+    source: Annotated[Path, typer.Argument(metavar="INPUT", help="Model to view; with --live the OUT of a track.")],
     images: Annotated[
         Path | None,
         _options.PLAIN.option(
-            "Folder of the photographs. Default: the one that groma map noted, or a folder images near INPUT.",
+            "Folder of the photographs. Default: the one recorded by groma map, or a folder images near INPUT.",
             metavar="DIR",
         ),
     ] = None,
@@ -29,10 +29,10 @@ def view(
     browser: Annotated[bool, _options.PLAIN.option("Open a browser.")] = True,
     force: _options.ForceReport = False,
 ) -> None:
-    """Look at a scene in the browser: cameras, points, lines, planes. Click a line for its observations.
+    """View a scene in the browser: cameras, points, lines, planes. Click a line for its observations.
 
-    The page is served from this machine, to this machine only, until Ctrl-C. --json writes the address and the counts
-    as soon as the page is ready. With --live the page shows a running track as it grows, and its result at the end.
+    The page is served to this machine only, until Ctrl-C. --json writes the address and the counts as soon as the page
+    is ready. With --live the page shows a running track, and its result at the end.
     """
     import contextlib
 

@@ -18,17 +18,17 @@ def warmup(
         typer.Argument(
             autocompletion=_complete.one_of(*_complete.COMPILED),
             metavar="PART",
-            help="What to compile for: adjust, map, track; everything if left out.",
+            help="Commands to compile for: adjust, map, track. Default: all.",
         ),
     ] = None,
-    again: Annotated[bool, _options.PLAIN.option("Run even if everything is there.", "--again")] = False,
+    again: Annotated[bool, _options.PLAIN.option("Run even if everything is compiled.", "--again")] = False,
     force: _options.ForceReport = False,
 ) -> None:
-    """Compile and keep what groma adjust, groma map and groma track need on this machine.
+    """Compile the kernels of groma adjust, groma map and groma track for this machine.
 
-    Small scenes are adjusted, mapped and tracked, and what is compiled on the way is kept on disk: in NUMBA_CACHE_DIR
-    if that is set, else beside the sources, else (where those cannot be written) in the user's cache folder. Useful
-    after an installation, an upgrade or a change of the processor, and when an image of a machine is built.
+    Small scenes are adjusted, mapped and tracked, and the compiled code is kept on disk: in NUMBA_CACHE_DIR if that is
+    set, else beside the sources, else (if these are read-only) in the user's cache folder. Use it after an
+    installation, an upgrade or a change of the processor, and when building a machine image.
     """
     from groma.cli.shared import output as _output
 

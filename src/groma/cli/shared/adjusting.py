@@ -203,9 +203,9 @@ def why_no_covariances(scene: Scene, path: Path) -> list[str]:
     ]
     more = [f"and {len(groups) - 4} more"] if len(groups) > 4 else []
     return [
-        f"{path} was not written: the images fall into {len(groups)} groups that share nothing, and how certain one is "
-        f"relative to another is not defined: {', '.join(parts + more)}. Add matches between them, or adjust each "
-        "group as a scene of its own."
+        f"{path} was not written: the images fall into {len(groups)} groups without common landmarks, and "
+        f"covariances between groups are not defined: {', '.join(parts + more)}. Add matches between them, or adjust "
+        "each group as a scene of its own."
     ]
 
 

@@ -42,8 +42,8 @@ Json = Annotated[
     str | None,
     GENERAL.option("Write a machine-readable report to FILE; '-' is standard output.", "--json", metavar="FILE"),
 ]
-Quiet = Annotated[bool, GENERAL.option("Say nothing but errors.", "--quiet", "-q")]
-Verbose = Annotated[bool, GENERAL.option("Say more.", "--verbose", "-v")]
+Quiet = Annotated[bool, GENERAL.option("Show errors only.", "--quiet", "-q")]
+Verbose = Annotated[bool, GENERAL.option("Show more details.", "--verbose", "-v")]
 Threads = Annotated[
     int | None,
     GENERAL.option("Use at most N threads. Default: one per core, where that pays.", "--threads", min=1, metavar="N"),

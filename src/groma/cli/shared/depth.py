@@ -19,19 +19,19 @@ PANEL = Panel("Depth maps")
 Depth = Annotated[
     Path | None,
     PANEL.option(
-        "Depth maps of the photographs, of their names and sizes: 16-bit PNG (millimetres), .npy or .npz "
-        "(metres); they give the map its unit of length.",
+        "Depth maps with the names and sizes of the photographs: 16-bit PNG (millimetres), .npy or .npz (metres); they "
+        "define the unit of length.",
         metavar="FOLDER",
     ),
 ]
 DepthScale = Annotated[
     float | None,
-    PANEL.option("Numbers in depth maps per metre. Default: 1000 for whole numbers, 1 for fractions.", metavar="S"),
+    PANEL.option("Depth values per metre. Default: 1000 for integers, 1 for floating point.", metavar="S"),
 ]
 RelativeDepth = Annotated[
     bool,
     PANEL.option(
-        "Each depth map has a scale of its own, as guessed from one photograph; it is estimated.",
+        "Estimate a scale for each depth map, as for monocular depth networks.",
         "--relative-depth/--metric-depth",
     ),
 ]

@@ -42,7 +42,7 @@ def try_diagnosis(
             say(DIAGNOSING, 0, 1)
             return make()
     except Exception as error:  # whatever it is, the result of the command is worth more
-        console.warn(f"What the data determine could not be found out: {error}")
+        console.warn(f"The diagnosis failed: {error}")
         return None
 
 

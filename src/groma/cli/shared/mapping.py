@@ -56,12 +56,12 @@ def run_map(
         *stages_of_map(options, start, survey is not None, line_matches is not None, depth is not None)
     )
     if has_stages(work):
-        console.say(f"Going on from the finished stages in {work}, as far as they fit.")
+        console.say(f"Resuming from the finished stages in {work}.")
     try:
         with interruptible() as interruption, console.stages() as stages, loading("map", options.threads):
             return map_images(images, work, model, options, interruption.checking(stages), line_matches, survey, depth)
     except KeyboardInterrupt:
-        words = f"finished stages are kept in {work}: the same command goes on from there."
+        words = f"finished stages are kept in {work}: the same command resumes there."
         raise typer.Exit(PROCESS.tell(words)) from None
 
 

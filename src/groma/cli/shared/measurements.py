@@ -26,7 +26,7 @@ Positions = Annotated[
     str | None,
     PANEL.option(
         "Measured camera positions: name, coordinates, standard deviations (CSV, or geo.txt of OpenDroneMap),"
-        " or exif for the GPS of the photographs. The scene is brought into their frame.",
+        " or exif for the GPS of the photographs. The scene is transformed into their frame.",
         metavar="FILE",
     ),
 ]
@@ -55,18 +55,16 @@ class Measured:
     position_sigma: Annotated[
         str | None,
         PANEL.option(
-            "Standard deviation of positions where the file states none; or horizontal, vertical.", metavar="S[,S[,S]]"
+            "Standard deviation of positions without one in the file; or horizontal, vertical.", metavar="S[,S[,S]]"
         ),
     ] = None
     control: Control = None
     control_sigma: Annotated[
         str | None,
-        PANEL.option("Standard deviation of their coordinates; or horizontal, vertical.", metavar="S[,S[,S]]"),
+        PANEL.option("Standard deviation of control points; or horizontal, vertical.", metavar="S[,S[,S]]"),
     ] = None
     mark_sigma: Annotated[float, PANEL.option("Standard deviation of marks, pixels.", metavar="PX", min=1e-3)] = 1.0
-    check: Annotated[
-        str | None, PANEL.option("Control points that are kept back to check the result.", metavar="NAME,...")
-    ] = None
+    check: Annotated[str | None, PANEL.option("Control points to hold out as check points.", metavar="NAME,...")] = None
     distances: Annotated[
         Path | None,
         PANEL.option(
@@ -76,30 +74,30 @@ class Measured:
         ),
     ] = None
     distance_sigma: Annotated[
-        float | None, PANEL.option("Standard deviation of distances where the file states none.", metavar="S")
+        float | None, PANEL.option("Standard deviation of distances without one in the file.", metavar="S")
     ] = None
     directions: Annotated[
         Path | None,
         PANEL.option(
-            "Known directions: photograph, where down is in the axes of its camera (x right, y down, z forward), "
-            "degrees; or line:5 vertical 0.5.",
+            "Known directions: image, direction of down in its camera frame (x right, y down, z forward), standard "
+            "deviation in degrees; or line:5 vertical 0.5.",
             metavar="FILE",
         ),
     ] = None
     direction_sigma: Annotated[
         float | None,
-        PANEL.option("Standard deviation of directions where the file states none, degrees.", metavar="DEG"),
+        PANEL.option("Standard deviation of directions without one in the file, degrees.", metavar="DEG"),
     ] = None
     known_planes: Annotated[
         Path | None,
         PANEL.option(
-            "What is on planes with known coordinates: p1 z 12.3 0.01, or plane:2 0 0 1 -12.3 0.01 (n.X + w = 0).",
+            "Objects on planes with known coordinates: p1 z 12.3 0.01, or plane:2 0 0 1 -12.3 0.01 (n.X + w = 0).",
             metavar="FILE",
         ),
     ] = None
     plane_sigma: Annotated[
         float | None,
-        PANEL.option("Standard deviation of the distance from known planes where the file states none.", metavar="S"),
+        PANEL.option("Standard deviation of known planes without one in the file.", metavar="S"),
     ] = None
     poses: Annotated[
         Path | None,
@@ -112,23 +110,21 @@ class Measured:
     pose_sigma: Annotated[
         str | None,
         PANEL.option(
-            "Standard deviations of poses where the file states none: of positions, and of orientations in degrees.",
+            "Standard deviations of poses without one in the file: of positions, and of orientations in degrees.",
             metavar="S,DEG",
         ),
     ] = None
     hold: Annotated[
         str | None,
         PANEL.option(
-            "Images (also old/*), control points and landmarks (line:5) that keep the place they have.",
+            "Images (also old/*), control points and landmarks (line:5) to hold fixed.",
             metavar="NAME,...",
         ),
     ] = None
     crs: Crs = None
     keep_suspects: Annotated[
         bool,
-        PANEL.option(
-            "Leave in what the test for gross errors would take out; it is named all the same.", "--keep-suspects"
-        ),
+        PANEL.option("Report gross errors, but keep them in the adjustment.", "--keep-suspects"),
     ] = False
 
     def validate(self) -> None:

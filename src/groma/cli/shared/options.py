@@ -22,7 +22,7 @@ ForceReport = Annotated[bool, GENERAL.option("Replace the file of --json.", "--f
 Contributions = Annotated[
     bool,
     RESULTS.option(
-        "Also adjust by points alone, with lines, with planes, and say what each of them changes.", "--contributions"
+        "Also adjust with points only, with lines and with planes, and report what each contributes.", "--contributions"
     ),
 ]
 Truth = Annotated[
@@ -32,7 +32,7 @@ Truth = Annotated[
 LineDetector = Annotated[
     str,
     LANDMARKS.option(
-        "What finds line segments: lsd, onnx:FILE (a network like M-LSD), or a detector of an installed package.",
+        "Line segment detector: lsd, onnx:FILE (a network like M-LSD), or a detector of an installed package.",
         choices=_complete.DETECTORS,
         metavar="NAME",
     ),
@@ -40,8 +40,8 @@ LineDetector = Annotated[
 RollingShutter = Annotated[
     str | None,
     CAMERAS.option(
-        "Images were read row by row (or column by column: photographs turned upright): estimate how the "
-        "camera moved meanwhile.",
+        "Model a rolling shutter, read by rows (or columns, for photographs rotated afterwards): estimate the camera "
+        "motion during readout.",
         metavar="rows|columns",
     ),
 ]

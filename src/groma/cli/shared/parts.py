@@ -135,7 +135,7 @@ def _checked(source: Path, wanted: PartsWanted, refused: dict[str, Any], rank: i
             f"{source} is not a folder of parts (part-*.npz) that this process can see. Processes adjust together "
             "what groma convert MODEL PARTS --parts has cut, in a folder that all of them see."
             if has_company()
-            else f"There is nothing at {source}."
+            else f"{source} does not exist."
         )
     if output is None:
         raise InputError("Parts are adjusted into a folder: pass -o OUT.")

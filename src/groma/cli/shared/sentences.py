@@ -124,7 +124,7 @@ def describe_structure(relations: Mapping[str, int]) -> list[str]:
 def describe_relations(relations: Mapping[str, Mapping[str, int]]) -> list[str]:
     """Return how many relations between landmarks of each kind hold, and how many the robust loss gave up."""
     return [
-        f"  {name.replace('_', ' ')}: {outcome['held']:,} hold, {outcome['dropped']:,} given up"
+        f"  {name.replace('_', ' ')}: {outcome['held']:,} kept, {outcome['dropped']:,} rejected"
         for name, outcome in relations.items()
     ]
 
@@ -169,7 +169,7 @@ def say_contributions(console: Console, entries: Sequence[Mapping[str, Any]]) ->
         if entry["center_sigma"] is None and (number == 0 or not entries[number - 1]["center_sigma_missing"]):
             console.say(f"Centres not predicted with {entry['added']}: {entry['center_sigma_missing'].rstrip('.')}.")
         if entry["num_relations"]:
-            given_up = f"{entry['num_dropped']:,} of {entry['num_relations']:,} relations given up"
+            given_up = f"{entry['num_dropped']:,} of {entry['num_relations']:,} relations rejected"
             console.say(f"With {entry['added']}: {given_up}.")
 
 

@@ -60,16 +60,16 @@ class MotionGates:
 
 @dataclass(frozen=True)
 class MotionOptions:
-    """How a motion is found."""
+    """Options of the estimation of motions."""
 
-    #: Where the random choice of samples begins.
+    #: Random seed of the samples.
     seed: int = 0
     gates: MotionGates = field(default_factory=MotionGates)
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A motion and how well it is known."""
+    """An estimated motion with its covariance."""
 
     kind: Kind
     #: (4, 4) b_from_a; of a projective motion with norm one.
@@ -99,7 +99,7 @@ class Motion:
 
 
 def estimate_motion(matches: LandmarkMatches, kind: Kind = "rigid", options: MotionOptions | None = None) -> Motion:
-    """Find the motion between two copies of the same lines and points, of which some may be matched wrongly.
+    """Estimate the motion between two copies of the same lines and points robustly.
 
     Parameters
     ----------

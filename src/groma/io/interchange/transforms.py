@@ -84,7 +84,7 @@ _WRITTEN = {
 
 @dataclass(frozen=True, eq=False)
 class Transforms:
-    """A scene, and what else its file says."""
+    """A scene, and the other entries of its file."""
 
     #: Cameras, poses and points.
     scene: Scene

@@ -31,7 +31,7 @@ def open_sequence(
     max_frames: int | None = None,
     kind: Kind | None = None,
 ) -> Sequence:
-    """Open an image sequence; its layout is told by what lies in the folder. Frames are read when they are asked for.
+    """Open an image sequence; its layout is recognised from the folder. Frames are read on demand.
 
     Parameters
     ----------

@@ -44,17 +44,17 @@ from groma.localization.pose.verdict import (
 
 @dataclass(frozen=True)
 class PoseOptions:
-    """How a pose is looked for."""
+    """Options of the estimation of a pose."""
 
     #: Seed of the random samples.
     seed: int = 0
-    #: Largest distance of a match from where a proposed pose puts it, pixels; by default from the stated noise.
+    #: Maximum reprojection error of an inlier of a proposed pose, pixels; by default from the stated noise.
     max_error: float | None = None
     #: Estimate focal length and distortion from the matches, too.
     refine_lens: bool = False
-    #: Look for a second place that fits as well.
+    #: Search for a second pose that fits equally well.
     look_for_rival: bool = True
-    #: Focal lengths that are tried, over that of the camera: :data:`UNKNOWN_LENS` where nothing is known of it.
+    #: Focal lengths to try, relative to that of the camera: :data:`UNKNOWN_LENS` for an unknown one.
     focal_factors: tuple[float, ...] = (1.0,)
 
     def lens_of(self, camera: QueryCamera) -> FreeLens | None:
@@ -80,7 +80,7 @@ class MirrorQuestions:
 
 @dataclass(frozen=True, eq=False)
 class AbsolutePose:
-    """A pose and how far it is to be trusted."""
+    """An estimated pose, its covariance and the outcome of its tests."""
 
     #: ``localized``: believed; ``uncertain``: found, but chance, another place, or directions that nothing
     #: determines, are not excluded; ``failed``: none.
@@ -147,7 +147,7 @@ def estimate_absolute_pose(
     covariances: tuple[npt.ArrayLike | None, npt.ArrayLike | None] = (None, None),
     options: PoseOptions | None = None,
 ) -> AbsolutePose:
-    """Estimate where a camera was from matches of points, of lines, or of both; many may be wrong.
+    """Estimate the pose of a camera robustly from matches of points, lines or both.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def estimate_absolute_pose(
     Returns
     -------
     AbsolutePose
-        Also where no pose is found: its status then is ``failed``, and its sentence says why.
+        If no pose is found, its status is ``failed`` and its sentence says why.
     """
     points, segments = np.asarray(_or_none(points2d, 2)), np.asarray(_or_none(segments2d, 2, 2))
     of = ((points, 3, covariances[0]), (segments, 6, covariances[1]))

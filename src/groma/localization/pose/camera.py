@@ -18,7 +18,7 @@ from groma.scene import Cameras
 
 @dataclass(frozen=True, eq=False)
 class QueryCamera:
-    """A calibration: model, parameters, size of the image."""
+    """A calibrated camera: model, parameters and image size."""
 
     #: A name of :func:`groma.cameras.models` whose images a plane can hold.
     model: str

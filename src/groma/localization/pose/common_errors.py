@@ -47,7 +47,7 @@ class CommonErrorGates:
     """Of which maps common errors are told."""
 
     unknowns: int = gate(
-        4000, "unknowns", "of poses and calibrations at most; of larger maps nothing is told", "cost: their square"
+        4000, "unknowns", "of poses and calibrations at most; larger maps are treated as exact", "cost: their square"
     )
     loss: float = gate(3.0, "sigma", "scale of the Geman-McClure loss of its landmarks", "convention: three sigma")
 

@@ -296,6 +296,6 @@ def _log_choose(n: int, k: int) -> float:
 
 def _open(sigma: FloatArray) -> str:
     if not np.isfinite(sigma).all():
-        return "the camera could move without any of them noticing"
+        return "the camera could move without changing any of them"
     shift, turn = float(np.linalg.norm(sigma[:3])), float(np.rad2deg(np.linalg.norm(sigma[3:])))
     return f"its standard deviation is {shift:.3g} scene units and {turn:.2g} degrees"

@@ -39,7 +39,7 @@ class NeighborGates:
         25.0, "deg", "between rays of shared points, above which they count less", "chosen on benchmarks/lines.py"
     )
     sample: int = gate(
-        64, "points", "looked at per pair of images for the angle", "cost: the median of so many is enough"
+        64, "points", "sampled per pair of images for the angle", "cost: the median of so many is enough"
     )
     max_turn_deg: float = gate(
         60.0, "deg", "between viewing directions, where there are no points", "chosen on benchmarks/lines.py"

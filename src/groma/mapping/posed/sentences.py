@@ -20,7 +20,7 @@ _NAMES = 12
 def about_noise(place: float | None, turn: float | None, unit: float, count: int) -> list[str]:
     """Say how good the given poses are: standard deviations of a coordinate, in units of the file."""
     if place is None and turn is None:
-        return [f"The {count} given poses agree with the photographs as closely as these can tell."]
+        return [f"The {count} given poses agree with the photographs within their accuracy."]
     parts = [] if place is None else [f"{place * unit:.2g} units of length in each coordinate"]
     parts += [] if turn is None else [f"{np.degrees(turn):.2g} degrees about each axis"]
     return [f"Noise of the {count} given poses that were used, as the photographs show it: {' and '.join(parts)}."]
@@ -42,9 +42,9 @@ def about_gross_errors(
         for row, distance, degrees in zip(rows.tolist(), apart, angle, strict=True)
     ]
     if len(rows) == 1:
-        return [f"The given pose of {each[0]} is wrong beyond its noise; the image was placed anew by its matches."]
+        return [f"The given pose of {each[0]} is wrong beyond its noise; its pose was estimated from its matches."]
     return [
-        f"The given poses of {len(rows)} images are wrong beyond their noise; the images were placed anew by their "
+        f"The given poses of {len(rows)} images are wrong beyond their noise; they were estimated from "
         f"matches: {first_of(each, _NAMES)}."
     ]
 

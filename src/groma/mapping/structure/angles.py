@@ -53,7 +53,7 @@ class AngleGates:
     """Which angles are right."""
 
     layer: float = gate(
-        0.15, "rad", "around right angles and none, in which they are told from others", "chosen on synthetic rooms"
+        0.15, "rad", "window around right and zero angles, for the mixture", "chosen on synthetic rooms"
     )
     exact: float = gate(8.7e-4, "rad", "that angles deviate which count as exact", "convention: 0.05 degrees")
     most: float = gate(8.7e-3, "rad", "that angles deviate which are meant to be right", "convention: half a degree")

@@ -154,7 +154,7 @@ def detect_structure(
     report("finding directions", 0, 1)
     directions, along = parallels()
     found = {"lines_meeting": meeting()}
-    report("finding what lies on what", 0, 1)
+    report("finding relations", 0, 1)
     enough = options.planes.min_support
     planes, point_on_plane, line_on_plane = on_fitted_planes(marks, planes, level, (least, least_line), enough)
     support = point_on_plane.counts(len(planes)) + 2 * line_on_plane.counts(len(planes))

@@ -30,7 +30,10 @@ class JunctionGates:
         8.0, "px", "from the end of a line to the place of meeting", "chosen on benchmarks/structure.py"
     )
     layer_px: float = gate(
-        8.0, "px", "of distance, in which lines that meet are told from others", "chosen on benchmarks/structure.py"
+        8.0,
+        "px",
+        "window of distances for the mixture of meeting and passing lines",
+        "chosen on benchmarks/structure.py",
     )
     end_px: float = gate(
         2.5, "px", "deviation of the end of a line from where it meets another", "chosen on benchmarks/structure.py"

@@ -43,7 +43,10 @@ class RelationGates:
         8, "neighbours", "at whose distance a landmark has its surroundings", "chosen on benchmarks/surveyed.py"
     )
     layer: float = gate(
-        3.0, "bands", "around a plane, in which members are told from clutter", "derived from deviations up to the band"
+        3.0,
+        "bands",
+        "window around a plane for the mixture of members and clutter",
+        "derived from deviations up to the band",
     )
     widest: float = gate(
         0.33, "layers", "that members of a plane may deviate", "derived from normal noise: the layer holds 3 deviations"

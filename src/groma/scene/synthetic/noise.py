@@ -18,7 +18,7 @@ from groma.scene.scene import Scene
 
 @dataclass(frozen=True, eq=False)
 class SyntheticScene:
-    """A scene whose truth is known."""
+    """A synthetic scene with exact ground truth."""
 
     #: Exact cameras and landmarks, noisy measurements.
     truth: Scene

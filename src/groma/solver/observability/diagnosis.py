@@ -89,7 +89,7 @@ class Diagnosis:
 def diagnose(
     problem: Problem, names: Names | None = None, eliminate: str | tuple[str, ...] = "auto", threads: int = 1
 ) -> Diagnosis:
-    """Say what the data determine and what they do not.
+    """Report what the data determine and what they do not.
 
     Parameters
     ----------

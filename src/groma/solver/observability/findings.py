@@ -15,7 +15,7 @@ from groma.solver.observability.messages import listing
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing worth knowing."""
+    """One finding of a diagnosis."""
 
     #: For programs: ``point_no_parallax``, ``line_along_motion``, ``camera_unobservable`` and so on.
     kind: str

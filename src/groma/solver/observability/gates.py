@@ -25,7 +25,7 @@ class DiagnosisGates:
         1e-5, "share", "a motion that costs more of what its size suggests is held", "derived from rounding"
     )
     sample: int = gate(
-        4096, "points", "points looked at for the middle and extent of the scene", "cost: time of a diagnosis"
+        4096, "points", "points used for the centre and extent of the scene", "cost: time of a diagnosis"
     )
     large_residual: float = gate(3.0, "ratio", "residuals of a camera that stands out, to the usual", _WORDS)
     min_residual: float = gate(1.5, "sigma", "and at least so large", _WORDS)

@@ -228,7 +228,7 @@ def _flat(inspection: Inspection, name: str, weakness: FloatArray, seen: Observe
         Finding(
             "planar_scene", "warning",
             "All points lie on one plane: poses follow from a homography, which with two views has two solutions, and "
-            "focal lengths cannot be told from distances in views that face it. Add points off the plane.",
+            "focal lengths cannot be separated from distances in frontal views. Add points off the plane.",
             name, tuple(int(i) for i in np.flatnonzero(good)), {"flatness": float(extent[0] / max(extent[1], 1e-300))},
         )
     ]  # fmt: skip

@@ -41,7 +41,7 @@ class PlaneOutcome:
         if not self.held:
             return f"No planes: what was found in the {among} did not hold in the adjustment."
         on = f"{counted(self.points, 'points')} and {counted(self.lines, 'lines')}"
-        left = f"; {counted(self.dropped, 'landmarks')} did not hold to theirs" if self.dropped else ""
+        left = f"; {counted(self.dropped, 'landmarks')} contradicted theirs" if self.dropped else ""
         return f"Found in the {among}: {counted(self.held, 'planes')} with {on}{left}."
 
     def numbers(self) -> dict:

@@ -164,7 +164,7 @@ class RectificationGates:
     )
     as_sure: float = gate(
         1.5, "ratio", "of variances of yaw, up to which the estimate from more keyframes is the better one",
-        "derived from variances told by 15 cells: they differ by a half",
+        "derived from variances estimated from 15 cells: they differ by a half",
     )  # fmt: skip
     start_over: float = gate(
         0.3,

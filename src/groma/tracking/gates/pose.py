@@ -97,15 +97,15 @@ class VerificationGates:
         18.0, "score", "points and lines (planes, if they are all) that agree with a pose", SEQUENCES
     )
     looser: float = gate(0.75, "share", "of a score, for a pose found by features or without points", SEQUENCES)
-    min_share: float = gate(0.35, "share", "share of what was looked at that agrees", SEQUENCES)
-    most: float = gate(0.65, "share", "of what was looked at agrees, where a pose is in doubt", SEQUENCES)
+    min_share: float = gate(0.35, "share", "share of the searched points and lines that agree", SEQUENCES)
+    most: float = gate(0.65, "share", "of the searched points and lines that agree, for a doubtful pose", SEQUENCES)
     min_kept: float = gate(0.12, "share", "share of what the last keyframe measured", SEQUENCES)
     confirmed_evidence: float = gate(6.0, "score", "points and lines where depth confirms a pose", SEQUENCES)
     min_agreeing: float = gate(0.03, "share", "share of the features in view that agree with a found pose", SEQUENCES)
     min_seen: float = gate(
         0.5, "share", "share of the points in view that agree, or features are asked too", "convention: the majority"
     )
-    surprise: float = gate(2.0, "sigma", "a pose farther from the prediction is looked at twice", SEQUENCES)
+    surprise: float = gate(2.0, "sigma", "a pose farther from the prediction is verified again", SEQUENCES)
     wider: float = gate(3.0, "ratio", "the prior of a pose found by features is wider", SEQUENCES)
     jump: float = gate(6.0, "sigma", "distance of a found pose from the prediction", SEQUENCES)
     lost_frames: int = gate(5, "frames", "lost, after which the camera can be anywhere and a map is begun", SEQUENCES)

@@ -99,7 +99,7 @@ def write_report(
     title: str = "Adjustment",
     contents: PageContents | None = None,
 ) -> None:
-    """Write a page that opens in any browser.
+    """Write a self-contained HTML report.
 
     Parameters
     ----------

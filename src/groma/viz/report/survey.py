@@ -58,6 +58,6 @@ def _check_points(points: Sequence[Mapping[str, Any]]) -> str:
     for one in points:
         off = [f"{value:.4f} \u00b1 {sigma:.4f}" for value, sigma in zip(one["difference"], one["sigma"], strict=True)]
         rows.append([one["name"], *off, f"{one['normalized_square']:.1f}"])
-    caption = "Points whose coordinates took no part: computed less measured, with the standard deviation of that. "
+    caption = "Points whose coordinates were not used: computed less measured, with the standard deviation of that. "
     caption += "Chi-square is 3 on average."
     return table("Check points", caption, ["point", "x", "y", "z", "chi-square"], rows)

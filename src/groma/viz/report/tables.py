@@ -102,7 +102,7 @@ def chart_cards(
         lengths = _known(_of_kind(after, kind))
         if len(lengths):
             earlier = _known(_of_kind(before, kind)) if before is not None else None
-            caption = f"Share of {len(lengths):,} residuals by their length, on a logarithmic axis. {key}"
+            caption = f"Share of {len(lengths):,} residuals by magnitude, on a logarithmic axis. {key}"
             cards.append((f"Residuals of {name}", caption, _charts.histogram(earlier, lengths)))
     if history is not None:
         caption = "Cost after each step, on a logarithmic axis. Hollow: a step that was refused."
@@ -180,7 +180,7 @@ def contributions_card(entries: Sequence[Mapping[str, Any]] | None) -> str:
     measures: list[tuple[str, Callable[[Mapping[str, Any]], Any]]] = [
         ("landmarks", lambda entry: f"{entry['num_landmarks']:,}"),
         ("relations", lambda entry: f"{entry['num_relations']:,}"),
-        ("given up", lambda entry: f"{entry['num_dropped']:,}"),
+        ("rejected", lambda entry: f"{entry['num_dropped']:,}"),
         *((f"{name}, px", lambda entry, name=name: entry["rmse_px"].get(name)) for name in pixels),
         ("moved", lambda entry: entry["moved"] if entry["moved"] else None),
         ("predicted", lambda entry: entry["center_sigma"]),
@@ -199,7 +199,7 @@ def contributions_card(entries: Sequence[Mapping[str, Any]] | None) -> str:
     chart, key = "", ""
     if shown:
         field = "center_error_percentiles" if against else "moved_percentiles"
-        whence = "the reference, in its units" if against else "where points alone put them, scene units"
+        whence = "the reference, in its units" if against else "the point-only result, scene units"
         chart = _charts.spreads(
             [(head[entries.index(entry)], entry[field], entry["center_sigma"] if against else None) for entry in shown],
             f"distance of the camera centres from {whence}",
@@ -208,8 +208,8 @@ def contributions_card(entries: Sequence[Mapping[str, Any]] | None) -> str:
         if against and any(entry["center_sigma"] is not None for entry in shown):
             key = key.removesuffix(".") + ", ring: predicted."
     caption = (
-        "The same scene adjusted by points alone, then by more and more. Residuals: rms of the inliers. Moved: "
-        "median distance of the camera centres from where points alone put them; predicted: their median standard "
+        "The same scene with points only, then with further landmarks. Residuals: rms of the inliers. Moved: "
+        "median distance of the camera centres from the point-only result; predicted: their median standard "
         "deviation, seen from the first camera"
         + ("; error: rms; all in units of the reference." if against else "; in scene units.")
         + key
@@ -285,11 +285,9 @@ def _relation_table(scene: Scene, outcomes: Mapping[str, Mapping[str, int]]) -> 
         for kind in scene.relations.kinds()
         if kind in there or kind in became
     ]
-    caption = (
-        "What lies on what, and which angles are right: how many there are, and how many of them the last adjustment "
-    )
-    caption += "held and gave up. What it gave up is no longer in the scene; lines that meet are held on request."
-    return table("Relations", caption, ["", "number", "held", "given up"], rows) if rows else ""
+    caption = "Structural relations: how many there are, and how many of them the last adjustment "
+    caption += "kept and rejected. Rejected ones are no longer in the scene; lines that meet are held on request."
+    return table("Relations", caption, ["", "number", "kept", "rejected"], rows) if rows else ""
 
 
 def _direction_table(scene: Scene) -> str:
