@@ -11,7 +11,7 @@ import pytest
 from _survey import ELSEWHERE, SIGMA, control, control_file, made, measured_positions, on_rigs, positions
 
 from groma.adjustment.adjust import AdjustOptions, adjust
-from groma.adjustment.assemble import assemble
+from groma.adjustment.assemble import assemble, first_camera_gauge
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.diagnosis import diagnose_scene
 from groma.adjustment.survey.attach import with_survey
@@ -354,6 +354,13 @@ def test_what_held_landmarks_leave_open(truth, kind, count, open_):
     directions = Directions(np.arange(2), np.eye(3)[:2])
     scene = truth.replace(directions=directions, held=Held(np.full(count, kind), np.arange(count)))
     assert coordinates_to_hold(scene, np.ones(8, bool)).sum() == open_
+
+
+def test_measurements_that_are_rejected_leave_the_gauge_alone(truth):
+    planes = PlanesFile(truth.images.names, np.tile([0, 0, 1.0, -1.0], (8, 1)), np.full(8, 0.01), "levels.txt")
+    scene = with_survey(truth, Survey(planes=planes)).scene
+    scene = scene.replace(known_planes=scene.known_planes.replace(rejected=np.ones(8, bool)))
+    assert np.array_equal(first_camera_gauge(scene), first_camera_gauge(scene.replace(known_planes=KnownPlanes())))
 
 
 @pytest.mark.parametrize("kind", [Kind.CONTROL_POINT, Kind.LINE, Kind.PLANE])

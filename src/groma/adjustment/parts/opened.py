@@ -39,6 +39,7 @@ from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.scene import Scene, Similarity
 from groma.scene.local_frame import local_frame
+from groma.scene.survey import accepted
 from groma.solver.reduce import exact_sums
 from groma.solver.reduce.contract import Reducer
 from groma.solver.reduce.shard import Shard
@@ -148,7 +149,7 @@ def open_parts(paths: Sequence[Path], options: AssemblyOptions, reducer: Reducer
         sizes = [path.stat().st_size for path in paths]
     _check_same(reducer, [[path.name, size] for path, size in zip(paths, sizes, strict=True)])
     with agreed(reducer):
-        head = read_archive(paths[0])
+        head = accepted(read_archive(paths[0]))
         near = local_frame(head)
         head = head if near is None else head.transformed(near)
     mine = np.flatnonzero(_owners(sizes, reducer.size) == reducer.rank)
@@ -202,7 +203,7 @@ def _sum_of(count: IntArray, reducer: Reducer) -> IntArray:
 
 
 def _read(path: Path, near: Similarity | None) -> Scene:
-    scene = read_archive(path)
+    scene = accepted(read_archive(path))
     return scene if near is None else scene.transformed(near)
 
 
