@@ -122,15 +122,8 @@ class Stopwatch:
 
 def count_unknowns(problem: Problem) -> int:
     """Return how many coordinates of variables that some factor touches may move."""
-    total = 0
     used = {ref.group for factor in problem.factors if len(factor) for _, ref in factor.references()}
-    for name in used:
-        group = problem.variables[name]
-        if group.is_constant:
-            continue
-        free = group.free_coordinates()
-        total += len(group) * group.manifold.dof if free is None else int(free.sum())
-    return total
+    return sum(problem.variables[name].num_free for name in used)
 
 
 def _by_type(layout: Layout, values: list) -> dict:

@@ -149,7 +149,7 @@ def open_parts(paths: Sequence[Path], options: AssemblyOptions, reducer: Reducer
         sizes = [path.stat().st_size for path in paths]
     _check_same(reducer, [[path.name, size] for path, size in zip(paths, sizes, strict=True)])
     with agreed(reducer):
-        head = accepted(read_archive(paths[0]))
+        head = read_archive(paths[0])
         near = local_frame(head)
         head = head if near is None else head.transformed(near)
     mine = np.flatnonzero(_owners(sizes, reducer.size) == reducer.rank)
@@ -192,7 +192,7 @@ def _read_own(
                 groups[name].append(group)
         parts.append(Part(paths[number], rows))
         held |= {name: made.problem.variables[name] for name in _held_besides(made)}
-        facts[number] = _facts(scene, options, made)
+        facts[number] = _facts(accepted(scene), options, made)
         count += observations_of_frames(scene)
     return parts, held | {name: _joined(group) for name, group in groups.items()}, facts, count
 
@@ -203,7 +203,7 @@ def _sum_of(count: IntArray, reducer: Reducer) -> IntArray:
 
 
 def _read(path: Path, near: Similarity | None) -> Scene:
-    scene = accepted(read_archive(path))
+    scene = read_archive(path)
     return scene if near is None else scene.transformed(near)
 
 
