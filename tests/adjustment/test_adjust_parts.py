@@ -1,5 +1,7 @@
 """Adjustment in parts on disk: what a part holds, the same result as at once, and what is refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ import groma
 from groma.adjustment.parts import adjust_parts, write_parts
 from groma.errors import InputError, OutputError
 from groma.evaluation import evaluate_poses
-from groma.factors.losses import Cauchy
+from groma.factors.losses import Cauchy, Huber
 from groma.scene import synthetic
 from groma.solver.options import SolverOptions
 
@@ -101,6 +103,22 @@ def test_refuses_what_does_not_belong_together(scene, tmp_path):
         adjust_parts([tmp_path / "empty.npz"], tmp_path / "x")
     with pytest.raises(InputError, match="at least one observation"):
         write_parts(scene, tmp_path / "x", observations=0)
+
+
+@pytest.mark.parametrize("loss", [None, Huber(1.0)])
+def test_landmarks_alone_are_adjusted_in_parts(scene, tmp_path, loss):
+    """With cameras held nothing is shared: what landmarks have left to gain still counts."""
+    scene = scene.points_only()
+    paths = write_parts(scene, tmp_path / "parts", observations=150)
+    result = adjust_parts(
+        paths, tmp_path / "out", loss=loss, options=replace(OPTIONS, max_iterations=300), refine_poses=False
+    )
+    told = groma.AdjustOptions(
+        loss=loss.name if loss else "none", refine_poses=False, function_tolerance=1e-12, max_iterations=300
+    )
+    whole = groma.adjust(scene, told).report.solve
+    assert whole.final_cost < 0.5 * whole.initial_cost
+    assert result.report.final_cost == pytest.approx(whole.final_cost, rel=1e-6)
 
 
 @pytest.mark.compiled

@@ -66,6 +66,14 @@ def test_a_scene_in_ground_coordinates_is_adjusted_as_well(start, near):
     np.testing.assert_array_equal(far.problem.variables["frames"].state, far.scene.frames.rig_from_world)
 
 
+@pytest.mark.parametrize("form", ["metric", "pixels"])
+def test_the_problem_of_a_scene_in_ground_coordinates_is_that_of_its_result(start, form):
+    """All that factors measure in the world is moved back with it; lines lose digits 5,000 km from the origin."""
+    far = adjust(start.transformed(TO_UTM), replace(OPTIONS, structure_form=form))
+    again = solve(far.problem, SolverOptions(max_iterations=0)).report
+    assert again.final_costs == pytest.approx(far.report.solve.final_costs, rel=1e-5, abs=1e-5)
+
+
 @pytest.mark.parametrize("exponent", [-12, -9, -6, -3, -1, 1, 3, 6, 9, 12])
 def test_the_unit_of_length_does_not_matter(start, exponent):
     """As many steps, and the same minimum: under least squares and robust losses, and with lines alone."""

@@ -16,16 +16,17 @@ import groma
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
-from groma.adjustment.parts import adjust_parts, join_parts, write_parts
+from groma.adjustment.parts import adjust_parts, join_parts, num_ties_cut, write_parts
 from groma.adjustment.survey.given_poses import given_poses_of
 from groma.adjustment.survey.protocol import protocol
 from groma.factors.losses import Trivial
 from groma.geometry import se3
-from groma.io.archive import read_archive
+from groma.io.archive import read_archive, write_archive
 from groma.mapping.surveyed import adjust_surveyed
 from groma.problem.residuals import residuals_of
-from groma.scene import CameraPositions, Held, PosePriors
+from groma.scene import CameraPositions, Held, KnownPlanes, PosePriors
 from groma.scene.survey import Kind, diagonal_covariance
+from groma.scene.synthetic.scenes import holistic
 
 LEAST_SQUARES = AdjustOptions(loss="none", point_sigma_px=0.5, check_lens=False)
 UTM = np.array([4e5, 5.4e6, 200.0])
@@ -63,6 +64,23 @@ def test_parts_are_the_whole(truth_and_start, tmp_path):
     np.testing.assert_array_equal(kept[0], scene.points.xyz[70])
     assert joined.held.kind.tolist() == [Kind.POINT, Kind.IMAGE] and len(joined.known_planes) == 8
     np.testing.assert_allclose(joined.control_points.xyz, whole.scene.control_points.xyz, atol=1e-4)
+
+
+def test_held_lines_stay_in_parts_and_keep_their_points(tmp_path):
+    """Lines that fit badly are started again between two stages, but not those that are held, in parts as at once."""
+    scene = holistic(20, noise_px=0.5, seed=1).start
+    rows = np.array([1, 3, 5, 6])
+    scene = scene.replace(held=Held(np.full(4, Kind.LINE), rows))
+    assert num_ties_cut(scene, 300) == num_ties_cut(scene.replace(held=Held()), 300) == 0
+    paths = write_parts(scene, tmp_path / "parts", observations=300)
+    rejected = KnownPlanes([0], [0], np.zeros((1, 3)), np.eye(1, 4, 2), np.ones(1), np.ones(1, bool))
+    write_archive(read_archive(paths[0]).replace(known_planes=rejected), paths[0], force=True)
+    adjust_parts(paths, tmp_path / "adjusted", Trivial())
+    joined = join_parts([tmp_path / "adjusted" / path.name for path in paths])
+    place = {int(number): row for row, number in enumerate(joined.lines.ids)}
+    after = joined.lines.plucker[[place[int(number)] for number in scene.lines.ids[rows]]]
+    np.testing.assert_allclose(after, scene.lines.plucker[rows], atol=1e-12)
+    assert len(joined.known_planes) == 1  # what is rejected takes no part, and stays
 
 
 def test_measurements_hold_the_gauge(truth_and_start):

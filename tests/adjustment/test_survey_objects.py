@@ -11,7 +11,7 @@ import pytest
 from _survey import ELSEWHERE, SIGMA, control, control_file, made, measured_positions, on_rigs, positions
 
 from groma.adjustment.adjust import AdjustOptions, adjust
-from groma.adjustment.assemble import assemble
+from groma.adjustment.assemble import assemble, first_camera_gauge
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.diagnosis import diagnose_scene
 from groma.adjustment.survey.attach import with_survey
@@ -21,11 +21,21 @@ from groma.adjustment.survey.reliability import reliability
 from groma.adjustment.terms.open_motions import coordinates_to_hold
 from groma.adjustment.uncertainty import position_sigma
 from groma.errors import InputError
-from groma.geometry import incidence, line3, quaternion, se3
+from groma.geometry import incidence, line3, quaternion, se3, so3
 from groma.io.survey import DirectionsFile, DistancesFile, PlanesFile, PosesFile
 from groma.problem.residuals import residuals_of
-from groma.scene import CameraPoses, Distances, Held, KnownDirections, KnownPlanes, PosePriors
+from groma.scene import (
+    CameraPoses,
+    Directions,
+    Distances,
+    Held,
+    KnownDirections,
+    KnownPlanes,
+    PosePriors,
+    Similarity,
+)
 from groma.scene.survey import Kind
+from groma.scene.synthetic.noise import project_pinhole
 from groma.scene.synthetic.scenes import holistic
 
 LEAST_SQUARES = AdjustOptions(loss="none", point_sigma_px=0.5, check_lens=False)
@@ -328,6 +338,48 @@ def test_what_measurements_leave_open_is_held_and_nothing_else(truth, kinds, ope
         scene = truth.replace(held=Held(np.zeros(len(kinds), int), np.arange(len(kinds))))
     held = coordinates_to_hold(scene, np.ones(8, bool))
     assert held.sum() == open_
+
+
+@pytest.mark.parametrize(
+    ("kind", "count", "open_"),
+    [
+        (Kind.POINT, 1, 4), (Kind.CONTROL_POINT, 1, 4), (Kind.CONTROL_POINT, 2, 1), (Kind.CONTROL_POINT, 3, 0),
+        (Kind.LINE, 1, 3), (Kind.LINE, 3, 0), (Kind.PLANE, 1, 4), (Kind.DIRECTION, 1, 5), (Kind.DIRECTION, 2, 4),
+    ],
+)  # fmt: skip
+def test_what_held_landmarks_leave_open(truth, kind, count, open_):
+    """A place leaves turns and scale, two the turn about their line; a line a shift, a turn and a scale, two more none,
+    if they do not meet.
+    """
+    directions = Directions(np.arange(2), np.eye(3)[:2])
+    scene = truth.replace(directions=directions, held=Held(np.full(count, kind), np.arange(count)))
+    assert coordinates_to_hold(scene, np.ones(8, bool)).sum() == open_
+
+
+def test_measurements_that_are_rejected_leave_the_gauge_alone(truth):
+    planes = PlanesFile(truth.images.names, np.tile([0, 0, 1.0, -1.0], (8, 1)), np.full(8, 0.01), "levels.txt")
+    scene = with_survey(truth, Survey(planes=planes)).scene
+    scene = scene.replace(known_planes=scene.known_planes.replace(rejected=np.ones(8, bool)))
+    assert np.array_equal(first_camera_gauge(scene), first_camera_gauge(scene.replace(known_planes=KnownPlanes())))
+
+
+@pytest.mark.parametrize("kind", [Kind.CONTROL_POINT, Kind.LINE, Kind.PLANE])
+def test_held_landmarks_alone_hold_the_scene(kind):
+    """A scene that begins a similarity away from what is held of it goes there; no camera is held against that."""
+    scene = holistic(8, noise_px=0.0, seed=1).truth
+    points, marks, xyz = control(scene, np.random.default_rng(2), 4, 0)
+    poses = scene.cam_from_world[marks.image_idx]
+    marks = marks.replace(pixel=project_pinhole(scene.cameras.params[0], poses, xyz[marks.point_idx])[0])
+    scene = scene.replace(control_points=points.replace(xyz=xyz, role=np.zeros(4, int)), marks=marks)
+    turn = so3.exp(np.array([[0.01, -0.02, 0.015]]))[0]
+    start = scene.transformed(Similarity(1.01, turn, np.array([0.03, -0.02, 0.02])))
+    name = {Kind.CONTROL_POINT: "control_points", Kind.LINE: "lines", Kind.PLANE: "planes"}[kind]
+    table = getattr(scene, name)
+    start = start.replace(**{name: table, "held": Held(np.full(len(table), kind), np.arange(len(table)))})
+    result = adjust(start, replace(LEAST_SQUARES, max_iterations=100))
+    assert result.report.solve.final_cost < 1e-6 * result.report.solve.initial_cost
+    if kind != Kind.PLANE:  # three planes meet in a point, from where the scene may have any size
+        np.testing.assert_allclose(result.scene.cam_centers_in_world, scene.cam_centers_in_world, atol=1e-3)
 
 
 def test_gravity_keeps_the_size_of_a_scene():

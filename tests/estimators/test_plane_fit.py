@@ -51,6 +51,16 @@ def test_fit_of_points_on_a_line_leaves_a_tilt_open():
     assert tilt_sigma(fit_plane(points, noise_of(points)).covariance) > 1.0
 
 
+@pytest.mark.kernels
+def test_points_at_one_place_leave_both_tilts_open_and_certain_ones_are_refused():
+    """Of both numbers come out, or one line that says what to do."""
+    points = np.ones((5, 3))
+    covariance = fit_plane(points, noise_of(points)).covariance
+    assert np.isfinite(covariance).all() and tilt_sigma(covariance) > 1.0
+    with pytest.raises(InputError, match="positive trace"):
+        fit_plane(np.eye(3), np.zeros((3, 3, 3)))
+
+
 def test_walls_among_clutter():
     rng = np.random.default_rng(2)
     walls = [wall(rng, 300, 0, 0.0), wall(rng, 300, 1, 0.0), wall(rng, 200, 2, 0.0)]

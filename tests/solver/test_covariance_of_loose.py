@@ -10,6 +10,7 @@ from problems import EXACT, held, pixels_of, scene_problem
 from groma.errors import ProblemError
 from groma.factors import LineReprojection, PointOnPlane, PointReprojection
 from groma.factors.contract import Ref
+from groma.geometry.manifold import Euclidean
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.solver.covariance.marginals import Covariances
@@ -119,3 +120,39 @@ def test_lost_cameras_are_an_error():
     rows = np.flatnonzero((factor.pose.index < 3) | (factor.point.index > 26))
     with pytest.raises(ProblemError, match=r"rank deficient by \d+; 2 of 5 poses are not determined.*diagnose"):
         Covariances(Problem(problem.variables, [factor.take(rows)]))
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+@pytest.mark.parametrize("constant", [[False, False, False], [False, True, True], [True, True, False]])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_plane_on_points_seen_once_is_not_determined(seed, constant, count):
+    """Elimination of the points leaves rounding of it: no deviation is made of that, whichever way it falls."""
+    problem = held(scene_problem(num_points=40, num_planes=1, seed=seed))
+    seen, on = problem.factors
+    alone = np.arange(30, 30 + count)
+    once = np.unique(seen.point.index, return_index=True)[1]
+    seen = seen.take(np.flatnonzero(~np.isin(seen.point.index, alone) | np.isin(np.arange(len(seen)), once)))
+    group = problem.variables["planes"]
+    state = np.vstack([group.state, group.manifold.from_ambient(np.array([[1, 0.1, 0, 0.2]]))])
+    planes = Variables(group.manifold, state, np.array([[False] * 3, constant]))
+    both = PointOnPlane(point=Ref("points", alone), plane=Ref("planes", np.ones(count, int)), sqrt_information=200.0)
+    covariances = Covariances(Problem({**problem.variables, "planes": planes}, [seen, on, both]))
+    assert covariances.undetermined("planes").tolist() == [1]
+    assert covariances.undetermined("points").tolist() == alone.tolist()
+    assert np.isfinite(covariances.of("planes", 0)).all() and np.isfinite(covariances.of("poses")).all()
+
+
+def test_variables_without_a_measurement_have_no_covariance():
+    """Of a whole group, too; what is held of it is certain."""
+    problem = held(scene_problem(num_points=30))
+    spare = Variables(Euclidean(3, "point"), np.zeros((3, 3)), np.array([False, True, False]))
+    covariances = Covariances(Problem({**problem.variables, "spare": spare}, problem.factors))
+    assert covariances.undetermined("spare").tolist() == [0, 2]
+    assert np.isnan(covariances.of("spare")).all(axis=(1, 2)).tolist() == [True, False, True]
+    assert not covariances.of("spare", 1).any()
+    joint = covariances.joint([("points", 0), ("spare", 2), ("points", 0), ("spare", 1), ("points", 0)])
+    own = covariances.of("points", 0)[0]
+    for row in (0, 6, 12):
+        for column in (0, 6, 12):
+            np.testing.assert_allclose(joint[row : row + 3, column : column + 3], own, rtol=1e-6)
+    assert np.isnan(joint[3:6]).all() and not joint[9:12, 9:12].any()

@@ -66,6 +66,17 @@ def test_landmark_without_information_stays():
     assert any("unobservable direction" in warning for warning in solution.report.warnings)
 
 
+@pytest.mark.parametrize("constant_poses", [False, True])
+def test_landmarks_that_are_held_are_not_called_unobservable(constant_poses):
+    """Whole points and single coordinates of them, in a joint solve and where every point is a problem of its own."""
+    problem = scene_problem(num_points=30, constant_poses=constant_poses)
+    held = np.zeros((30, 3), bool)
+    held[:4], held[7, 1] = True, True
+    points = dataclasses.replace(problem.variables["points"], constant=held)
+    report = solve(Problem({**problem.variables, "points": points}, problem.factors)).report
+    assert report.num_underdetermined_landmarks == 0 and report.warnings == []
+
+
 def test_not_finite_start_is_an_outcome():
     problem = scene_problem(num_points=10)
     factor = dataclasses.replace(problem.factors[0], sqrt_information=1e200)

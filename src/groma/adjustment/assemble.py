@@ -185,7 +185,7 @@ def camera_variables(scene: Scene, options: AssemblyOptions, gauge: BoolArray | 
     gauge : (F, 6) bool, optional
         What ``first_camera`` holds, where the scene is one part of a whole; else :func:`first_camera_gauge`.
     """
-    chart = POSE_CHARTS[options.pose_chart]
+    chart = POSE_CHARTS["left"]
     held: bool | BoolArray = not options.refine_poses
     if options.refine_poses and options.gauge == "first_camera":
         held = first_camera_gauge(scene) if gauge is None else gauge
@@ -237,7 +237,7 @@ def first_camera_gauge(
     first : int, optional
         The frame that is held; by default the first with half of the usual number of observations.
     """
-    poses = scene.frames.rig_from_world
+    scene, poses = accepted(scene), scene.frames.rig_from_world
     held = np.zeros((len(poses), 6), dtype=bool)
     if len(poses) == 0:
         return held

@@ -11,7 +11,6 @@ from groma.errors import InputError, did_you_mean
 from groma.factors.losses import Loss, Trivial
 from groma.geometry.charts.line_charts import LINE_CHARTS
 from groma.geometry.charts.plane_charts import PLANE_CHARTS
-from groma.geometry.charts.pose_charts import POSE_CHARTS
 
 #: How well landmarks keep to what they lie on, as a length in the images, pixels: walls are not flat.
 SURFACE_SIGMA_PX = 0.2
@@ -62,8 +61,6 @@ class AssemblyOptions:
     line_chart: str = "cartesian"
     #: A name of :data:`groma.geometry.charts.plane_charts.PLANE_CHARTS`.
     plane_chart: str = "normal_offset"
-    #: A name of :data:`groma.geometry.charts.pose_charts.POSE_CHARTS`.
-    pose_chart: str = "left"
     #: How segments are compared with lines: ``endpoints``, the distances of the ends from the line in the image;
     #: ``bearing``, the angles between the rays of the ends and the plane through camera and line; ``normal``, the
     #: normal of that plane against the line's direction and the ray to its anchor.
@@ -113,7 +110,6 @@ class AssemblyOptions:
             ("point_chart", ("auto", "euclidean")),
             ("line_chart", LINE_CHARTS),
             ("plane_chart", PLANE_CHARTS),
-            ("pose_chart", POSE_CHARTS),
             ("line_residual", LINE_RESIDUALS),
             ("plane_residual", PLANE_RESIDUALS),
             ("structure_form", ("metric", "pixels")),

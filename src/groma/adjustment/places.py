@@ -15,6 +15,8 @@ from groma.factors.priors.on_known_plane import OnKnownPlane
 from groma.factors.priors.pose_prior import PosePrior
 from groma.factors.priors.position_prior import PositionPrior
 from groma.factors.priors.vector_prior import VectorPrior
+from groma.factors.relations.line_on_plane import SegmentOnPlane
+from groma.factors.relations.on_plane_pixels import SegmentOnPlanePixels
 from groma.geometry import quaternion, se3
 from groma.geometry.manifold import Euclidean
 from groma.problem.problem import Problem
@@ -28,16 +30,21 @@ def at_places_of(problem: Problem, scene: Scene, shifted: bool = True) -> Proble
     the scene moved.
     """
     variables = dict(problem.variables)
-    for name in variables.keys() & {"frames", "points", "lines", "planes", "control_points"}:
-        group = variables[name]
-        if name == "frames":
-            state = scene.frames.rig_from_world
-        elif name == "control_points":
-            state = scene.control_points.xyz
+    states = {
+        "frames": scene.frames.rig_from_world,
+        "sensors": scene.sensors.cam_from_rig,
+        "control_points": scene.control_points.xyz,
+        "directions": scene.directions.vectors,
+    }
+    for name, group in problem.variables.items():
+        if name in states:
+            state = states[name]
         elif name == "points":
             state = point_variables(scene, "euclidean" if isinstance(group.manifold, Euclidean) else "auto").state
-        else:
+        elif name in ("lines", "planes"):
             state = group.manifold.from_ambient(scene.lines.plucker if name == "lines" else scene.planes.hesse)
+        else:
+            continue
         variables[name] = group.with_state(state)
     if not shifted or "frames" not in variables or not any(isinstance(factor, _IN_WORLD) for factor in problem.factors):
         return Problem(variables, problem.factors)
@@ -46,7 +53,7 @@ def at_places_of(problem: Problem, scene: Scene, shifted: bool = True) -> Proble
     return Problem(variables, [_shifted(factor, shift) for factor in problem.factors])
 
 
-_IN_WORLD = (PositionPrior, PosePrior, VectorPrior, Distance, OnKnownPlane)
+_IN_WORLD = (PositionPrior, PosePrior, VectorPrior, Distance, OnKnownPlane, SegmentOnPlane, SegmentOnPlanePixels)
 
 
 def _shifted(factor: Factor, shift: FloatArray) -> Factor:
@@ -61,6 +68,8 @@ def _shifted(factor: Factor, shift: FloatArray) -> Factor:
         return replace(factor, cam_from_world=poses)
     if isinstance(factor, Distance) and factor.first_camera is None:
         return replace(factor, first_arm=factor.first_arm + shift)
+    if isinstance(factor, SegmentOnPlane | SegmentOnPlanePixels):
+        return replace(factor, ends=factor.ends + shift)
     if isinstance(factor, OnKnownPlane):
         known = factor.known.copy()
         known[:, 3] -= known[:, :3] @ shift

@@ -21,6 +21,9 @@ from groma.errors import InputError, ShapeError
 from groma.estimators._plane_loops import fit_loop
 from groma.geometry.algebra import perpendicular, vectors
 
+#: Root of the information about what points do not tell at all; its inverse is squared, and still a number.
+_UNKNOWN = 1e-140
+
 
 @dataclass(frozen=True)
 class PlaneFit:
@@ -55,12 +58,12 @@ def fit_plane(
     Returns
     -------
     PlaneFit
-        The plane; points on one line leave one tilt open, and its covariance is then very large.
+        The plane; points on one line leave one tilt open, points at one place both: their covariance is very large.
 
     Raises
     ------
     ShapeError, InputError
-        If shapes do not fit, or there are fewer than three points.
+        If shapes do not fit, there are fewer than three points, or one has no variance.
     """
     points = vectors(points, 3, "points")
     covariances = np.asarray(covariances, dtype=np.float64)
@@ -71,6 +74,10 @@ def fit_plane(
     weights = np.ones(len(points)) if weights is None else np.asarray(weights, dtype=np.float64)
     if (weights > 0).sum() < 3:
         raise InputError(f"A plane needs at least 3 points of positive weight; got {int((weights > 0).sum())}.")
+    if not (spread := np.einsum("nii->n", covariances)[weights > 0]).min() > 0.0:
+        raise InputError(
+            f"Covariances of points must have a positive trace; got {spread.min()}. Say how uncertain they are."
+        )
     packed = np.ascontiguousarray(covariances[:, *np.triu_indices(3)])
     plane, center, precision = np.empty(4), np.empty(3), np.empty(len(points))
     fit_loop(
@@ -89,7 +96,7 @@ def fit_with_covariance(
     normal, away = plane[:3], points - center
     slope, motion = plane_motions(plane, center, points)
     information = (precision[:, None] * slope).T @ slope
-    size = np.sqrt(np.diag(information)) + np.finfo(float).tiny
+    size = np.maximum(np.sqrt(np.diag(information)), _UNKNOWN)
     correlation = information / np.outer(size, size) + 1e-12 * np.eye(3)
     inner = np.linalg.inv(correlation) / np.outer(size, size)
     count = int((weights > 0).sum())

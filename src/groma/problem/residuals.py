@@ -76,6 +76,13 @@ def jacobians_of(factor: Factor, variables: Mapping[str, Variables]) -> dict[str
     return blocks
 
 
+def root_matrices(factor: Factor) -> FloatArray:
+    """Return the square root of the information of each factor as matrices (N, m, m), not to be written to."""
+    root = np.asarray(factor.sqrt_information, dtype=np.float64)
+    root = root if root.ndim == 3 else root.reshape(-1, 1, 1) * np.eye(factor.residual_size)
+    return np.broadcast_to(root, (len(factor), *root.shape[1:]))
+
+
 def squared_norms(factor: Factor, variables: Mapping[str, Variables]) -> FloatArray:
     r"""Return :math:`\lVert \Sigma^{-1/2} r \rVert^2` (N,) of a group of factors, without the loss."""
     residuals = residuals_of(factor, variables)
@@ -86,4 +93,4 @@ def squared_norms(factor: Factor, variables: Mapping[str, Variables]) -> FloatAr
     return np.einsum("ni,ni->n", residuals, residuals) * information**2
 
 
-__all__ = ["Residuals", "jacobians_of", "residuals_of", "squared_norms"]
+__all__ = ["Residuals", "jacobians_of", "residuals_of", "root_matrices", "squared_norms"]

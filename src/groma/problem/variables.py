@@ -65,6 +65,12 @@ class Variables:
         constant = self.constant if self.constant.ndim == 2 else self.constant[:, None]
         return np.broadcast_to(~constant, (len(self), self.manifold.dof)).copy()
 
+    @property
+    def num_free(self) -> int:
+        """How many coordinates may move."""
+        free = self.free_coordinates()
+        return len(self) * self.manifold.dof if free is None else int(free.sum())
+
     def ambient(self) -> FloatArray:
         """Return what factors read, (count, ambient_size); it is computed once, and not to be written to."""
         return self._ambient

@@ -223,13 +223,8 @@ class CameraPoses(Table, noun="pose", optional=True):
     cam_from_world: FloatArray = column(np.float64, 7, world="poses", measured=True)
     #: (N, 6, 6) covariance of the shift along and the turn about the axes of the camera, scene units and radians.
     covariance: FloatArray = column(
-        np.float64,
-        6,
-        6,
-        length=((2, 2, 2, 1, 1, 1),) * 3 + ((1, 1, 1, 0, 0, 0),) * 3,
-        measured=True,
-        check=check_covariance,
-    )
+        np.float64, 6, 6, length=_POSE_LENGTHS, measured=True, check=check_covariance
+    )  # fmt: skip
     #: (N,) whether the row is a gross error that takes no part.
     rejected: BoolArray = column(np.bool_, fill=False)
 

@@ -268,7 +268,7 @@ class IndependentProblem:
     A step is accepted or refused variable by variable before the loop sees it.
     """
 
-    linear_iterations = 0
+    linear_name, linear_iterations = "blocks", 0
 
     def __init__(self, layout: Layout, workers: Workers, options: SolverOptions, watch: Stopwatch) -> None:
         with watch("setup"):

@@ -36,7 +36,7 @@ class JointProblem:
             self.linear = linear_solver(layout, options.linear_solver)
             self._refiner = landmark_refiner(layout, workers, options)
             states = to_solver_order(layout)
-        self._layout, self._watch = layout, watch
+        self._layout, self._watch, self.linear_name = layout, watch, self.linear.name
         self._reduction = Reduction(self.equations, self._system, self.linear, watch)
         self._damping = damping_from(first_damping(layout.problem.variables, options), layout.problem.variables)
         inputs = self.equations.prepare(states)

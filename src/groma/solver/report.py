@@ -122,15 +122,8 @@ class Stopwatch:
 
 def count_unknowns(problem: Problem) -> int:
     """Return how many coordinates of variables that some factor touches may move."""
-    total = 0
     used = {ref.group for factor in problem.factors if len(factor) for _, ref in factor.references()}
-    for name in used:
-        group = problem.variables[name]
-        if group.is_constant:
-            continue
-        free = group.free_coordinates()
-        total += len(group) * group.manifold.dof if free is None else int(free.sum())
-    return total
+    return sum(problem.variables[name].num_free for name in used)
 
 
 def _by_type(layout: Layout, values: list) -> dict:
@@ -146,7 +139,13 @@ def note_costs(
     """Write the costs at the start and at the end by factor type, and what could not be evaluated or determined."""
     report.initial_costs, report.final_costs = _by_type(layout, at_start), _by_type(layout, equations.costs)
     report.num_degenerate = {name: n for name, n in _by_type(layout, equations.num_degenerate).items() if n}
-    report.num_underdetermined_landmarks = singular
+    report.num_underdetermined_landmarks = max(singular - _num_held(layout), 0)
+
+
+def _num_held(layout: Layout) -> int:
+    """Return how many landmarks are held, all or in part: nothing is counted for what is held of them."""
+    free = (layout.problem.variables[e.group].free_coordinates() for e in layout.eliminated)
+    return sum(int((~one).any(axis=1).sum()) for one in free if one is not None)
 
 
 def warn_of_oddities(report: SolveReport) -> None:

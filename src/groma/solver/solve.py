@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -100,7 +101,7 @@ def solve(
     report.threads = options.threads or (available_cores() if report.num_factors >= FACTORS_FOR_THREADS else 1)
     workers = Workers(report.threads)
     try:
-        run = _evaluate if options.max_iterations == 0 else _solve_jointly if layout.kept else _solve_independently
+        run = _evaluate if options.max_iterations == 0 else _minimised
         with one_blas_thread():
             states = run(layout, workers, options, report, watch, progress)
     finally:
@@ -205,21 +206,12 @@ def _evaluate(
     return states
 
 
-def _solve_jointly(
+def _minimised(
     layout: Layout, workers: Workers, options: SolverOptions, report: SolveReport, watch: Stopwatch, progress
 ) -> States:
-    problem = JointProblem(layout, workers, options, watch)
-    report.linear_solver = problem.linear.name
-    report.termination = minimise(problem, options, report, watch, progress)
-    problem.note_end(report)
-    return problem.states
-
-
-def _solve_independently(
-    layout: Layout, workers: Workers, options: SolverOptions, report: SolveReport, watch: Stopwatch, progress
-) -> States:
-    problem = IndependentProblem(layout, workers, options, watch)
-    report.linear_solver = "blocks"
+    kind: type[Any] = JointProblem if layout.kept else IndependentProblem
+    problem = kind(layout, workers, options, watch)
+    report.linear_solver = problem.linear_name
     report.termination = minimise(problem, options, report, watch, progress)
     problem.note_end(report)
     return problem.states

@@ -30,7 +30,7 @@ from groma.execution import map_in_threads
 from groma.factors.contract import Factor
 from groma.gates import gate
 from groma.problem.problem import Problem
-from groma.problem.residuals import jacobians_of, residuals_of
+from groma.problem.residuals import jacobians_of, residuals_of, root_matrices
 from groma.solver.covariance.marginals import Covariances
 from groma.solver.linear.blas import one_blas_thread
 
@@ -124,9 +124,7 @@ def _rows_of(factor: Factor, kind: str, problem: Problem, first: dict[str, int],
     if slot is None or len(factor) == 0:
         return None
     residual, blocks = residuals_of(factor, problem.variables), jacobians_of(factor, problem.variables)
-    information = np.asarray(factor.sqrt_information, dtype=np.float64)
-    whiten = information if information.ndim == 3 else information.reshape(-1, 1, 1) * np.eye(factor.residual_size)
-    whiten = np.broadcast_to(whiten, (len(factor), *whiten.shape[1:]))
+    whiten = root_matrices(factor)
     residual = np.einsum("nij,nj->ni", whiten, residual)
     square = np.einsum("ni,ni->n", residual, residual)
     _, weight, bend = factor.loss.evaluate(square)

@@ -163,8 +163,7 @@ def _rings(camera: IntArray, radius: FloatArray, cameras: int, rings: int) -> In
 
 def _may_lack(group: Variables, model: CameraModel, wider: str) -> bool:
     """Whether a wider model would free something that is not free already."""
-    free = group.free_coordinates()
-    return wider != model.name or (free is not None and not free.any())
+    return wider != model.name or group.is_constant
 
 
 def of_points(problem: Problem, most: int) -> Problem:

@@ -73,7 +73,7 @@ def rig_that_does_not_fit(scene: Scene, problem: Problem, threads: int | None = 
     if not before > 0.0:
         return None
     sensors = begun.variables[SENSORS]
-    freed = solve(_with_free_sensors(begun, reference), options).problem if _is_held(sensors) else begun
+    freed = solve(_with_free_sensors(begun, reference), options).problem if sensors.is_constant else begun
     alone = solve(_with_free_images(freed, reference), options).problem
     on_rig, apart = (median_px(_seen(found), found) for found in (freed, alone))
     if _explained(freed, alone, on_rig, apart) >= GATES.share:
@@ -98,19 +98,9 @@ def _seen(problem: Problem) -> list[PointReprojection]:
 
 def _explained(problem: Problem, freer: Problem, before: float, after: float) -> float:
     """Return the share of the variance that disappears, less what the additional unknowns take up of noise alone."""
-    unknowns, more = (sum(_free(group) for group in one.variables.values()) for one in (problem, freer))
+    unknowns, more = (sum(group.num_free for group in one.variables.values()) for one in (problem, freer))
     redundancy = max(problem.num_residuals - unknowns, 1)
     return 1.0 - (after / before) ** 2 - (more - unknowns) / redundancy
-
-
-def _free(group: Variables) -> int:
-    free = group.free_coordinates()
-    return len(group) * group.manifold.dof if free is None else int(free.sum())
-
-
-def _is_held(sensors: Variables) -> bool:
-    free = sensors.free_coordinates()
-    return free is not None and not free.any()
 
 
 def _with_free_sensors(problem: Problem, reference: BoolArray) -> Problem:

@@ -105,12 +105,16 @@ def _parts_of_landmarks(scene: Scene, observations: int) -> tuple[IntArray, IntA
     part = np.empty(len(seen), np.int64)
     part[order] = (np.cumsum(seen[order]) - seen[order]) // observations
     of_points, of_lines = np.split(part, [scene.num_points])
-    tied, pair = np.unique(scene.relations.point_on_line[:, 0], return_index=True)
-    of_points[tied] = of_lines[scene.relations.point_on_line[pair, 1]]
-    for name, column, kinds in object_references(Scene):  # what was measured of landmarks is in the first part
+    measured = np.zeros(scene.num_points, bool)  # what was measured of landmarks is in the first part, as they are
+    for name, column, kinds in object_references(Scene):
         index, kind = getattr(getattr(scene, name), column), getattr(getattr(scene, name), kinds)
-        of_points[index[kind == Kind.POINT]] = 0
+        measured[index[kind == Kind.POINT]] = True
         of_lines[index[kind == Kind.LINE]] = 0
+    point, line = scene.relations.point_on_line.T
+    of_lines[line[measured[point]]] = 0
+    tied, pair = np.unique(point, return_index=True)
+    of_points[tied] = of_lines[line[pair]]
+    of_points[measured] = 0
     return of_points, of_lines
 
 

@@ -39,6 +39,7 @@ from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.scene import Scene, Similarity
 from groma.scene.local_frame import local_frame
+from groma.scene.survey import accepted
 from groma.solver.reduce import exact_sums
 from groma.solver.reduce.contract import Reducer
 from groma.solver.reduce.shard import Shard
@@ -191,7 +192,7 @@ def _read_own(
                 groups[name].append(group)
         parts.append(Part(paths[number], rows))
         held |= {name: made.problem.variables[name] for name in _held_besides(made)}
-        facts[number] = _facts(scene, options, made)
+        facts[number] = _facts(accepted(scene), options, made)
         count += observations_of_frames(scene)
     return parts, held | {name: _joined(group) for name, group in groups.items()}, facts, count
 

@@ -19,6 +19,7 @@ from groma.adjustment.relation_outcome import drop_failed_relations
 from groma.adjustment.rescue.restart import renew_lines, with_seen_ends
 from groma.adjustment.rescue.slips import without_slips
 from groma.adjustment.stages import STAGES, one_after_another, stage_entries
+from groma.adjustment.terms.objects import with_held_states
 from groma.factors.losses import GemanMcClure, Loss, Trivial
 from groma.gates import chi_square_gate
 from groma.io.archive import write_archive
@@ -147,10 +148,10 @@ class Run:
             scene, made = self.opened.assembled(part, states, loss)
             problem, moved = made.problem, []
             if not last:
-                problem, renewed = renew_lines(scene, problem, self.options.threads)
+                problem, renewed = with_held_states(problem, *renew_lines(scene, problem, self.options.threads))
                 moved.append(renewed)
             if robust:
-                problem, renewed = without_slips(problem, self.options.threads)
+                problem, renewed = with_held_states(problem, *without_slips(problem, self.options.threads))
                 moved.append(renewed)
             for name, rows in part.rows.items():
                 states[name][rows] = problem.variables[name].state

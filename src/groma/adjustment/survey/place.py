@@ -36,7 +36,7 @@ from groma.geometry.incidence import closest_points
 from groma.geometry.manifold import Euclidean
 from groma.problem.gauge import world_motions
 from groma.problem.problem import Problem
-from groma.problem.residuals import jacobians_of, residuals_of
+from groma.problem.residuals import jacobians_of, residuals_of, root_matrices
 from groma.problem.variables import Variables
 from groma.scene import ControlPoints, Distances, Keypoints, Scene, Similarity
 from groma.scene.survey import UNKNOWN, Kind, accepted
@@ -174,11 +174,7 @@ def moved(motions: dict[str, FloatArray], factor: Factor, problem: Problem) -> F
 
 def weighted(factor: Factor, problem: Problem) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return residuals (N, m), information (N, m, m) and the weights (N,) that a robust loss left."""
-    residual = residuals_of(factor, problem.variables)
-    root = np.asarray(factor.sqrt_information, float)
-    if root.ndim < 3:
-        information = np.broadcast_to(root**2, len(residual))[:, None, None] * np.eye(residual.shape[1])
-    else:
-        information = np.swapaxes(root, 1, 2) @ root
+    residual, root = residuals_of(factor, problem.variables), root_matrices(factor)
+    information = np.swapaxes(root, 1, 2) @ root
     squares = np.einsum("ni,nij,nj->n", residual, information, residual)
     return residual, information, factor.loss.evaluate(squares)[1]

@@ -20,7 +20,7 @@ import numpy as np
 from groma._typing import FloatArray, IntArray
 from groma.factors.contract import Factor
 from groma.problem.problem import Problem
-from groma.problem.residuals import jacobians_of, residuals_of
+from groma.problem.residuals import jacobians_of, residuals_of, root_matrices
 from groma.solver.covariance.marginals import Covariances, Variable
 
 
@@ -69,8 +69,7 @@ def with_kept(covariances: Covariances, group: str, index: int) -> dict[str, Flo
 def _pushes(problem: Problem, factor: Factor, effect: dict[str, FloatArray], size: int) -> FloatArray:
     """By how much each measurement (N, size) of a factor group moves the variable."""
     residuals = residuals_of(factor, problem.variables)
-    information = np.asarray(factor.sqrt_information, dtype=np.float64)
-    matrix = information if information.ndim == 3 else information.reshape(-1, 1, 1) * np.eye(residuals.shape[1])
+    matrix = root_matrices(factor)
     whitened = (matrix @ residuals[:, :, None])[:, :, 0]
     weighted = whitened * factor.loss.evaluate(np.einsum("nm,nm->n", whitened, whitened))[1][:, None]
     pull = (np.swapaxes(matrix, 1, 2) @ weighted[:, :, None])[:, :, 0]

@@ -28,7 +28,7 @@ from groma.problem.gauge import world_motions
 from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations
 from groma.problem.problem import Problem
-from groma.problem.residuals import jacobians_of, squared_norms
+from groma.problem.residuals import jacobians_of, root_matrices, squared_norms
 from groma.solver.linear.blocks import Blocks, multiply
 from groma.solver.linear.schur import ReducedSystem
 from groma.solver.steps import Step
@@ -207,8 +207,7 @@ def _costs_of_incidences(problem: Problem, motions: dict[str, FloatArray]) -> Fl
             axis=0,
         )
         weight = factor.loss.evaluate(squared_norms(factor, problem.variables))[1]
-        root = np.asarray(factor.sqrt_information, float)
-        J = root @ J if root.ndim == 3 else J * np.broadcast_to(root, len(factor))[:, None, None]
+        J = root_matrices(factor) @ J
         gram += np.einsum("n,nik,nil->kl", weight, J, J)
     return gram
 

@@ -41,6 +41,7 @@ from groma.solver.covariance.landmarks import Landmarks
 from groma.solver.covariance.rank_deficient import (
     LOOSE,
     deficiency,
+    hold_cancelled_coordinates,
     hold_unobservable_blocks,
     loses_the_cameras,
     zero_modes,
@@ -137,7 +138,10 @@ class Covariances:
         if layout.kept:
             self._system.assemble(0.0)
             seen = [self._system.diagonal(c).reshape(-1) != 0.0 for c in range(len(layout.kept))]
-            self._unseen = [~(part | held) for part, held in zip(seen, self._held, strict=True)]
+            cancelled, moved = hold_cancelled_coordinates(self._system)
+            self._unseen = [~(a | held) | b for a, held, b in zip(seen, self._held, cancelled, strict=True)]
+            for e, open_ in enumerate(self._undetermined if moved.any() else ()):
+                open_ |= self._landmarks.moved(e, moved, LOOSE)
             with one_blas_thread():
                 self._invert(gauge, datum and datum_of_parts(problem, self._divided, datum))
 
@@ -214,6 +218,8 @@ class Covariances:
                 out[at] = self._of_kept(c, member.blocks(rows), slice(member.offset, member.offset + dof))
             elif part in self._eliminated:
                 out[at] = self._of_landmarks(self._eliminated[part], self._position[part][rows])
+            else:
+                out[at[np.isin(rows, self._open(part))]] = np.nan
         return out
 
     def _checked(self, group: str, index: npt.ArrayLike | None) -> IntArray:
@@ -255,8 +261,10 @@ class Covariances:
         """Return the rows of the unobservable variables of a group of the divided problem."""
         if (e := self._eliminated.get(part)) is not None:
             return self._layout.eliminated[e].order[self._undetermined[e]].astype(np.int64)
-        if part not in self._kept:
-            return np.zeros(0, np.int64)
+        if part not in self._kept:  # held, or nothing was measured of them
+            variables = self._layout.problem.variables[part]
+            free = variables.free_coordinates()
+            return np.arange(len(variables)) if free is None else np.flatnonzero(free.any(axis=1))
         c, member = self._kept[part]
         blocks = member.blocks(np.arange(len(self._layout.problem.variables[part])))
         unseen = self._unseen[c].reshape(-1, self._layout.kept[c].width)[blocks]
@@ -311,54 +319,46 @@ class Covariances:
 
         Each costs one solve with the factorised system per degree of freedom; the variables need not share anything.
         """
-        layout = self._layout
-        sizes = [self.problem.variables[group].manifold.dof for group, _ in variables]
-        starts = np.concatenate([[0], np.cumsum(sizes)])
-        R = np.zeros((layout.num_kept_unknowns, starts[-1]))
-        out = np.zeros((starts[-1], starts[-1]))
-        rows_G: list[tuple[slice, FloatArray, FloatArray]] = []
-        broken = np.zeros(starts[-1], bool)
-        seen: dict[Variable, slice] = {}
-        for (group, i), start, size in zip(variables, starts, sizes, strict=False):
-            i = int(self._checked(group, i)[0])
-            at = slice(int(start), int(start) + size)
+        layout, datum = self._layout, self._datum
+        places, size = {}, 0
+        for group, index in variables:
+            variable = group, int(self._checked(group, index)[0])
+            if variable not in places:
+                places[variable] = slice(size, size + self.problem.variables[group].manifold.dof)
+                size = places[variable].stop
+        R, out, broken = np.zeros((layout.num_kept_unknowns, size)), np.zeros((size, size)), np.zeros(size, bool)
+        G, A = (np.zeros((size, 0 if datum is None else datum.G.shape[1])) for _ in range(2))
+        held = np.concatenate([np.zeros(0, bool), *self._held])
+        for (group, i), at in places.items():
             broken[at] = i in self.undetermined(group)
             ((_, part, row),) = self._divided.places(group, np.array([i]))
             if part in self._kept:
                 c, member = self._kept[part]
                 first = layout.kept[c].start + int(member.blocks(row)[0]) * layout.kept[c].width + member.offset
-                rows = slice(first, first + size)
-                R[rows, at] = np.eye(size)
-                R[:, at] *= ~np.concatenate(self._held)[:, None]
-                if self._datum is not None:
-                    rows_G.append((at, self._datum.G[rows], self._datum.A[rows]))
+                rows = slice(first, first + member.dof)
+                R[rows, at] = np.diag(np.where(held[rows], 0.0, 1.0))
+                if datum is not None:
+                    G[at], A[at] = datum.G[rows], datum.A[rows]
             elif part in self._eliminated:
-                e = self._eliminated[part]
-                eliminated, p = layout.eliminated[e], int(self._position[part][row[0]])
-                for c, incidences in eliminated.incidences.items():
+                e, p = self._eliminated[part], int(self._position[part][row[0]])
+                for c, incidences in layout.eliminated[e].incidences.items():
                     kept, B = layout.kept[c], self._landmarks.incidence(e, c)
                     for k in range(incidences.pointer[p], incidences.pointer[p + 1]):
                         first = kept.start + int(incidences.block[k]) * kept.width
                         R[first : first + kept.width, at] += B[k].T
-                local = -self._landmarks.inverses(e)[p]
-                out[at, at] += local
-                if (group, i) in seen:  # the same landmark asked for twice
-                    out[at, seen[group, i]] += local
-                    out[seen[group, i], at] += local
-                if self._datum is not None:
-                    rows = slice(p * size, (p + 1) * size)
-                    rows_G.append((at, self._datum.G_landmarks[e][rows], self._datum.A_landmarks[e][rows]))
-            seen.setdefault((group, i), at)
+                out[at, at] -= self._landmarks.inverses(e)[p]
+                if datum is not None:
+                    rows = slice(p * layout.eliminated[e].dof, (p + 1) * layout.eliminated[e].dof)
+                    G[at], A[at] = datum.G_landmarks[e][rows], datum.A_landmarks[e][rows]
         if layout.kept:
             out += R.T @ self._solve(R)
-        if self._datum is not None:
-            G, A = (np.zeros((starts[-1], self._datum.G.shape[1])) for _ in range(2))
-            for at, g, a in rows_G:
-                G[at], A[at] = g, a
-            out += self._datum.correction(G[None], A[None])[0]
+        if datum is not None:
+            out += datum.correction(G[None], A[None])[0]
         out[broken] = np.nan
         out[:, broken] = np.nan
-        return 0.5 * (out + out.T)
+        asked = [places[group, int(np.atleast_1d(index)[0])] for group, index in variables]
+        rows = np.concatenate([np.zeros(0, int), *(np.arange(at.start, at.stop) for at in asked)])
+        return 0.5 * (out + out.T)[np.ix_(rows, rows)]
 
     def derived(self, function: Callable[..., npt.ArrayLike], variables: Sequence[Variable]) -> Derived:
         """Return the value and covariance of a function of some variables.

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 r"""Unobservable kept variables: how to hold them, so that all others have their covariances.
 
-There are two sorts. A direction x of one plane with :math:`x^\top H x = 0` (two points hold it, and it can turn about
-them) moves no residual by itself, so it is coupled to nothing; small matrices tell, for any number of planes. What
-moves only together, such as a plane and points on it that are seen once, are modes of the reduced system whose
-eigenvalue is zero. Held along such directions the system can be inverted, and what they move is reported instead of
-estimated. Where they move more than a few cameras, nothing is left to refer covariances to, and that is an error.
+There are three sorts. Of a coordinate that landmarks follow, such as the offset of a plane on which nothing but points
+seen once lie, elimination leaves rounding where S should have zeros. A direction x of one plane with
+:math:`x^\top H x = 0` (two points hold it, and it can turn about them) moves no residual by itself, so it is coupled to
+nothing; small matrices tell, for any number of planes. What moves only together, such as a plane and points on it that
+are seen once, are modes of the reduced system whose eigenvalue is zero. Held along such directions the system can be
+inverted, and what they move is reported instead of estimated. Where they move more than a few cameras, nothing is left
+to refer covariances to, and that is an error.
 """
 
 from __future__ import annotations
@@ -20,11 +22,33 @@ from groma.solver.linear.blocks import Blocks
 from groma.solver.linear.elimination import LANDMARK_TOLERANCE, scaled_blocks
 from groma.solver.linear.fronts import Fronts
 from groma.solver.linear.modes import MODES, Modes, smallest
+from groma.solver.linear.schur import ReducedSystem
 
 #: A variable that moves by more than this in a scaled mode of zero cost is loose; this share of the poses may be.
 LOOSE, MAX_LOOSE = 1e-6, 0.2
 #: Modes of zero cost that are sought at most (cost: time and memory).
 MAX_MODES = 1024
+
+
+def hold_cancelled_coordinates(system: ReducedSystem) -> tuple[list[BoolArray], FloatArray]:
+    """Hold the coordinates of which the elimination of landmarks left rounding alone; blocks of S are changed.
+
+    Returns
+    -------
+    tuple
+        By kept class which unknowns (count * width,) they are; and their moves (unknowns, k) by what makes the diagonal
+        of H one, those of a block in columns of their own.
+    """
+    layout, found = system.layout, []
+    moves = np.zeros((layout.num_kept_unknowns, max(kept.width for kept in layout.kept)))
+    for c, kept in enumerate(layout.kept):
+        direct, S, steps = system.diagonal(c), system.S[c, c][: kept.count], np.arange(kept.width)
+        cancelled = (direct > 0.0) & (S[:, steps, steps] <= LANDMARK_TOLERANCE * direct)
+        S[:, steps, steps] += np.where(cancelled, direct, 0.0)
+        rows = np.flatnonzero(cancelled)
+        moves[kept.start + rows, rows % kept.width] = 1.0 / np.sqrt(direct.reshape(-1)[rows])
+        found.append(cancelled.reshape(-1))
+    return found, moves
 
 
 def hold_unobservable_blocks(

@@ -167,6 +167,8 @@ class ShardedProblem:
         self._here = ShardedTrial(cost=np.nan, states={name: group.state for name, group in variables.items()})
         #: Whether the shared system is that of the present states and damping.
         self._formed = False
+        #: Root of the sum over all shards of the squares of their landmarks' largest slopes.
+        self._steepest = 0.0
         self.num_factors = self.num_residuals = self.num_unknowns = self.linear_iterations = 0
         self.linear_name = ""
 
@@ -198,8 +200,8 @@ class ShardedProblem:
             self._form()
 
     def largest_gradient(self) -> float:
-        """Return the largest component of the gradient of the kept variables, over the root of its curvature."""
-        return self._sums.largest_gradient()
+        """Return the largest component of the gradient, over the root of its curvature; of landmarks a bound."""
+        return max(self._sums.largest_gradient(), self._steepest)
 
     def is_curved(self) -> bool:  # noqa: D102
         return self._sums.is_curved()
@@ -207,17 +209,13 @@ class ShardedProblem:
     def try_step(self) -> ShardedTrial:
         """Solve the shared system, and visit all shards: they are moved, and linearised where they come to be."""
         with self._watch("solve"):
-            layout, S, rhs = self._sums.system(self.damping)
-            linear = self._sums.solver(layout, self._options.linear_solver)
-            linear.follow(self.states)
-            step = linear.solve(S, rhs)
-        self.linear_name, self.linear_iterations = linear.name, linear.num_iterations
+            step, residual = self._shared_step()
         if step is None:
             return self._here.without_step()
         model = self._sums.model(step)
         factor = 1.0 / self._curvature
         visit = self._advance(step, factor)
-        decrease, withheld = predicted_decrease(model, linear.residual, (visit.squares, visit.slope), self.damping)
+        decrease, withheld = predicted_decrease(model, residual, (visit.squares, visit.slope), self.damping)
         slope, bend = 2.0 * decrease - withheld, 2.0 * (decrease - withheld)
         promised = factor * slope - 0.5 * factor**2 * self._curvature * bend
         fell = self._here.cost - visit.cost
@@ -232,6 +230,17 @@ class ShardedProblem:
             states=visit.states,
             curvature=2.0 * (factor * slope - fell) / max(factor**2 * bend, 1e-300),
         )
+
+    def _shared_step(self) -> tuple[list[FloatArray] | None, list[FloatArray] | None]:
+        """Solve the shared system; return the step, if there is one, and what an iterative solver leaves."""
+        if not self._kept:  # landmarks alone
+            return [], None
+        layout, S, rhs = self._sums.system(self.damping)
+        linear = self._sums.solver(layout, self._options.linear_solver)
+        linear.follow(self.states)
+        step = linear.solve(S, rhs)
+        self.linear_name, self.linear_iterations = linear.name, linear.num_iterations
+        return step, linear.residual
 
     def stretch(self, trial: ShardedTrial, factor: float) -> ShardedTrial:
         """Leave the trial as it is: a longer one would take another visit. The next step is longer instead."""
@@ -275,24 +284,26 @@ class ShardedProblem:
         """Visit all shards to form the shared system; return the cost and the number of degenerate factors."""
         self._sums.clear()
         self._formed = True
-        free = sum(_num_free(group) for name, group in self._variables.items() if name in self._landmarks)
-        self._sums.find(_found(unknowns=free))
+        free = sum(group.num_free for name, group in self._variables.items() if name in self._landmarks)
+        self._sums.find(_found(0.0, 0.0, 0.0, 0.0, free))
         for shard in self._shards:
             opened, equations, system, own = self._open(shard, self.states)
             cost = self._linearize(equations, system, own, self.damping)
             with self._watch("schur"):
                 self._sums.add(opened.layout, system)
-            counts = {"factors": opened.num_factors, "residuals": opened.num_residuals}
-            self._sums.find(_found(cost=cost, hidden=sum(equations.num_degenerate), **counts))
+            counts = sum(equations.num_degenerate), opened.num_factors, opened.num_residuals
+            self._sums.find(_found(cost, *counts, steepest=system.largest_landmark_slope()))
         cost, num_hidden, factors, residuals, unknowns = self._sum_up()[:5]
         self.num_factors, self.num_residuals = int(factors), int(residuals)
-        self.num_unknowns = int(unknowns) + sum(map(_num_free, self._kept.values()))
+        self.num_unknowns = int(unknowns) + sum(group.num_free for group in self._kept.values())
         return float(cost), int(num_hidden)
 
     def _sum_up(self) -> FloatArray:
         """Sum the shared system, and what else was found, over all processes."""
         with self._watch("schur"):
-            return self._sums.reduce()
+            found = self._sums.reduce()
+        self._steepest = float(np.sqrt(found[-1]))
+        return found
 
     def _advance(self, step: list[FloatArray], factor: float) -> _Visit:
         """Visit all shards to move the states by a multiple of a step, and form the shared system there.
@@ -324,10 +335,11 @@ class ShardedProblem:
             cost = self._linearize(equations, system, moved, lower)
             with self._watch("schur"):
                 self._sums.add(layout, system)
-            self._sums.find(np.array([cost, sum(equations.num_degenerate), *model, *lengths]))
+            found = cost, sum(equations.num_degenerate), *model, *lengths
+            self._sums.find(_found(*found, steepest=system.largest_landmark_slope()))
         found = self._sum_up()
         cost, num_hidden, squares, slope = (float(value) for value in found[:4])
-        lengths = found[4:].copy()
+        lengths = found[4:10].copy()
         for name, delta in zip(self._kept, step, strict=True):
             lengths += self._lengths(name, states[name], delta)
         return _Visit(trial, cost, int(num_hidden), lengths[:3], lengths[3:], squares, slope)
@@ -376,14 +388,9 @@ def _check(variables: Mapping[str, Variables], shards: Sequence[Shard], reducer:
             )
 
 
-def _found(cost: float = 0.0, hidden: int = 0, factors: int = 0, residuals: int = 0, unknowns: int = 0) -> FloatArray:
-    """Return what a shard adds to the sums besides its system, where the system is formed without a step."""
-    return np.array([cost, hidden, factors, residuals, unknowns] + [0.0] * (NUM_FOUND - 5))
-
-
-def _num_free(group: Variables) -> int:
-    free = group.free_coordinates()
-    return len(group) * group.manifold.dof if free is None else int(free.sum())
+def _found(*first: float, steepest: float = 0.0) -> FloatArray:
+    """Return what a shard adds to the sums besides its system: first numbers, and the largest slope of landmarks."""
+    return np.array([*first, *[0.0] * (NUM_FOUND - 1 - len(first)), steepest**2])
 
 
 __all__ = ["Shard", "ShardedProblem", "ShardedSolution", "solve_shards"]

@@ -22,7 +22,7 @@ from groma.solver.reduce.scattered import ScatteredBlocks
 from groma.solver.steps import States, largest_slope
 
 #: Numbers that are summed with the system: the cost and such (a format of messages).
-NUM_FOUND = 10
+NUM_FOUND = 11
 
 
 class SharedSystem:
