@@ -134,7 +134,7 @@ def tied(start: Scene, points: Scene, survey: Survey) -> Tied:
     return Tied(surveyed, start, points, near)
 
 
-@stage("surveyed", SCENE)
+@stage("surveyed", SCENE, lambda options: options.keep_suspects)
 def adjust_with_survey(points: Scene, options: Any, say: Callable[[str, int, int], None]) -> Scene:
     """Points and poses adjusted with measurements of other instruments, weighted by their noise."""
     told = AdjustOptions(
