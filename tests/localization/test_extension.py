@@ -60,6 +60,18 @@ def maps(place):
     return {half: Localizer(place / f"{half}.npz", place / half) for half in HALVES}
 
 
+def test_photographs_that_the_map_has_are_left_out(maps, place, tmp_path):
+    """A folder to which photographs were added is passed as a whole; old ones would be in the map twice."""
+    files = {name: place / half / name for half in HALVES for name in HALVES[half]}
+    choice = CalibrationChoice()
+    made = extended_model(maps["a"], files, tmp_path / "work", tmp_path / "images", choice, quiet)
+    assert sorted(made.scene.images.names) == FRAMES
+    assert made.warnings() == ["Left out, as the map has them already: 6 photographs."]
+    files = {name: place / "a" / name for name in HALVES["a"]}
+    with pytest.raises(InputError, match="The map has all of the 6 photographs already"):
+        extended_model(maps["a"], files, tmp_path / "work", tmp_path / "images", choice, quiet)
+
+
 def _off(scene, truth):
     rows = [list(truth.images.names).index(name.rpartition("/")[2]) for name in scene.images.names]
     return np.linalg.norm(scene.cam_centers_in_world - truth.cam_centers_in_world[rows], axis=1)

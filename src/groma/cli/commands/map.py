@@ -215,11 +215,11 @@ def map_(
     start, options = _start(console, images, model, poses, options)
     matches = read_matches(line_matches) if line_matches is not None else None
     true = read_scene(truth) if truth is not None else None
-    work = output.with_name(output.name + ".work")
+    work = _output.work_folder(output)
     photographs, extended = images, None
     if extend is not None:
         stages = stages_of_map(options, "model", bool(measured), matches is not None)
-        extended = extend_map(console, extend, images, map_images, output, force, stages)
+        extended = extend_map(console, extend, images, map_images, output, force, stages, seed)
         photographs, start = extended.folder, extended.scene
     survey = measured.read(photographs, lambda: _names_in(photographs)) if measured else None
     with work_with(console.threads):
