@@ -107,6 +107,10 @@ def test_near_names_are_suggested(arguments, suggested, tmp_path, capsys):
         (["adjust", "HERE", "--sigma0", "2"], "--sigma0 acts only with --covariance"),
         (["adjust", "HERE", "--covariance-gauge", "held"], "--covariance-gauge acts only with --covariance"),
         (["adjust", "HERE", "--keep", "always"], "--keep acts only on a folder of parts"),
+        (["adjust", "HERE", "--refine-principal-point"], "--refine-principal-point acts only with --refine-intrinsics"),
+        (["adjust", "HERE", "--mark-sigma", "2"], "--mark-sigma belongs to --control"),
+        (["adjust", "PARTS", "-o", "OUT", "--protocol", "OUT"], "--protocol is for whole scenes"),
+        (["adjust", "PARTS", "-o", "OUT", "--keep-suspects"], "--keep-suspects is for whole scenes"),
         (["map", "HERE", "-o", "OUT", "--model", "HERE", "--mapper", "global"], "--mapper acts only without --model"),
         (["localize", "HERE", "HERE", "-o", "OUT", "--no-lines", "--min-length", "20"], "--min-length acts only with"),
         (["track", "HERE", "-o", "OUT", "--camera-model", "PINHOLE"], "belong together"),
@@ -119,7 +123,9 @@ def test_near_names_are_suggested(arguments, suggested, tmp_path, capsys):
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )  # fmt: skip
 def test_options_that_would_do_nothing_are_refused(arguments, words, tmp_path, capsys):
-    places = {"HERE": tmp_path, "OUT": tmp_path / "out"}
+    places = {"HERE": tmp_path, "OUT": tmp_path / "out", "PARTS": tmp_path / "parts"}
+    places["PARTS"].mkdir()
+    (places["PARTS"] / "part-00000.npz").write_text("")
     assert run([str(places.get(word, word)) for word in arguments]) == 1
     assert words in capsys.readouterr().err
 

@@ -32,7 +32,6 @@ def align(
     control: _measured.Control = None,
     crs: _measured.Crs = None,
     force: _options.Force = False,
-    seed: _options.NoSeed = 0,
 ) -> None:
     """Bring a scene into the frame of a reference by a similarity, which ignores gross errors.
 

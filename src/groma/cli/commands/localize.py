@@ -93,7 +93,7 @@ def localize(
     options = LocalizeOptions(lines=lines, min_segment_length=min_length, pose=PoseOptions(seed=seed))
     console.expect_compilation("localize")
     console.expect_stages(*DESCRIBING, LOCALIZING, WRITING)
-    work = output.with_name(output.name + ".work")
+    work = _output.work_folder(output)
     try:
         with interruptible() as interruption, console.stages() as stages, work_with(console.threads):
             say = interruption.checking(stages)

@@ -115,7 +115,7 @@ def track(
     )
     options.make_detector()  # refuses a wrong name now
     console.expect_compilation("track")
-    work = output.with_name(output.name + ".work")
+    work = _output.work_folder(output)
     console.expect_stages(*(() if map_ is None else ("reading the map",)), *_STAGES, WRITING)
     with console.stages() as stages:
 
