@@ -81,25 +81,15 @@ def read_by_rows(scene: Scene, options: MapOptions, depth: object = None) -> boo
     return rolling
 
 
-@stage(
-    "rows",
-    SCENE,
-    lambda o: (o.rolling_shutter, o.refine_poses, o.refine_intrinsics, o.refine_rigs, o.max_iterations),
-)
+@stage("rows", SCENE, lambda options: (options.rolling_shutter, options.adjustment(threads=False)))
 def adjust_read_rows(start: Scene, options: MapOptions, say: Callable[[str, int, int], None]) -> Scene:
     """A model whose poses, points and motions during the readout, if there are some, are adjusted robustly."""
-    told = AdjustOptions(
-        refine_intrinsics=bool(options.refine_intrinsics),
-        refine_rigs=options.refine_rigs,
-        refine_poses=options.refine_poses,
-        max_iterations=options.max_iterations,
-        check_lens=False,
-        threads=options.threads,
-    )
     if options.rolling_shutter is not None:
         start = with_rolling_shutter(start, options.rolling_shutter)
     found = adjust_rolling_shutter(
-        start, told, lambda event: say("adjusting points and motions", event.iteration, event.max_iterations)
+        start,
+        options.adjustment(),
+        lambda event: say("adjusting points and motions", event.iteration, event.max_iterations),
     )
     return found.result.scene
 

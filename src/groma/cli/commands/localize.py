@@ -82,6 +82,7 @@ def localize(
     from groma.cli.shared.interrupt import PROCESS, interruptible
     from groma.cli.shared.mapping import WRITING
     from groma.execution import work_with
+    from groma.features.images import one_opencv_thread
     from groma.localization.calibration import CalibrationChoice
     from groma.localization.localizer import LocalizeOptions, Localizer
     from groma.localization.pose.absolute_pose import PoseOptions
@@ -91,6 +92,8 @@ def localize(
     choice = CalibrationChoice(calibration, camera_model, camera_parameters(camera_params))
     files = query_files(queries)
     options = LocalizeOptions(lines=lines, min_segment_length=min_length, pose=PoseOptions(seed=seed))
+    if console.threads is not None:  # each photograph has one of them
+        one_opencv_thread()
     console.expect_compilation("localize")
     console.expect_stages(*DESCRIBING, LOCALIZING, WRITING)
     work = _output.work_folder(output)

@@ -131,7 +131,10 @@ def _localizer(
 def _with_progress(console: Console, made: Callable[[Callable[[str, int, int], None]], _Made], kept: str) -> _Made:
     from groma.cli.shared.interrupt import interruptible
     from groma.execution import work_with
+    from groma.features.images import one_opencv_thread
 
+    if console.threads is not None:  # each photograph has one of them
+        one_opencv_thread()
     console.expect_compilation("map")
     try:
         with interruptible() as interruption, console.stages() as stages, work_with(console.threads):
