@@ -119,12 +119,18 @@ def _without_known(files: Mapping[str, Path], known: Sequence[Path]) -> dict[str
 
 
 def in_world_of(result: MapResult, before: Scene) -> MapResult:
-    """Return a map in the world of the one that it extends, by the poses of the images that both have."""
+    """Return a map in the world of the one that it extends, by the poses of the images that both have.
+
+    Where measurements say where it is, it is there; where they tell its scale, that stays.
+    """
     place = {name: row for row, name in enumerate(result.scene.images.names)}
     both = [(place[name], row) for row, name in enumerate(before.images.names) if name in place]
-    if len(both) < 2:
+    scene = result.scene
+    placed = scene.camera_positions, scene.camera_poses, scene.control_points, scene.pose_priors
+    if len(both) < 2 or scene.is_tied or any(map(len, placed)):
         return result
     now, then = np.array(both).T
-    moved: Similarity = align_poses(result.scene.cam_from_world[now], before.cam_from_world[then])
+    poses = scene.cam_from_world[now], before.cam_from_world[then]
+    moved: Similarity = align_poses(*poses, with_scale=not scene.has_scale)
     scenes = {name: getattr(result, name).transformed(moved) for name in ("scene", "before", "adjusted")}
     return replace(result, **scenes)
