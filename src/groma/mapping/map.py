@@ -100,7 +100,7 @@ StageProgress = Callable[[str, int, int], None]
 class MapOptions:
     """Options of :func:`map_images`."""
 
-    #: Shortest segment, pixels.
+    #: Shortest segment that is looked for, pixels; ``lines.min_length`` is that of one that is used.
     min_segment_length: float = MIN_LENGTH
     #: What finds the segments: an object, or a name of :data:`groma.features.registry.DETECTORS`.
     detector: str | SegmentDetector = "lsd"

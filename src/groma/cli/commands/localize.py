@@ -74,7 +74,10 @@ def localize(
 
     _output.check_outputs(force, output, json_target=console.json_target)
     check_inputs(map_, *queries, images)
-    refuse_idle(("--min-length", min_length != _MIN_LENGTH and not lines, "with lines"))
+    refuse_idle(
+        ("--min-length", min_length != _MIN_LENGTH and not lines, "with lines"),
+        ("--calibration", calibration != "auto" and camera_model is not None, "without --camera-model"),
+    )
 
     import shutil
 

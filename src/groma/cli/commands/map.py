@@ -195,7 +195,7 @@ def map_(
         min_segment_length=min_length,
         detector=line_detector,
         matcher=line_matcher,
-        lines=MapLinesOptions(cluster_size=cluster_size),
+        lines=MapLinesOptions(min_length=min_length, cluster_size=cluster_size),
         min_confidence=min_confidence,
         find_planes=planes,
         refine_points=refine_points,
@@ -212,6 +212,7 @@ def map_(
         threads=console.threads,
         seed=seed,
     )
+    refuse_idle(("--refine-rig", refine_rig and not (placed or options.rigs), "with --rig"))
     start, options = _start(console, images, model, poses, options)
     matches = read_matches(line_matches) if line_matches is not None else None
     true = read_scene(truth) if truth is not None else None
