@@ -66,6 +66,16 @@ def test_a_stage_is_made_again_where_an_option_of_its_own_has_changed(kept, opti
     assert kept.depends(MapOptions()) != kept.depends(MapOptions(**option))
 
 
+def test_objects_are_told_apart_by_what_they_hold():
+    """A detector of another package need not be a dataclass; its address says nothing, and may come again."""
+
+    class Detector:
+        def __init__(self, length):
+            self.length, self.network = length, object()
+
+    assert digest(Detector(12.0)) == digest(Detector(12.0)) != digest(Detector(20.0))
+
+
 @pytest.mark.parametrize("workers", [1, 2])
 def test_two_stages_beside_each_other_are_kept_like_two_after_each_other(tmp_path, model, workers):
     """Whatever the number of threads; and where the one fails, the other is left at its next step."""
