@@ -82,7 +82,7 @@ def localize(
     import shutil
 
     from groma.cli.shared.extending import DESCRIBING, LOCALIZING
-    from groma.cli.shared.interrupt import PROCESS, interruptible
+    from groma.cli.shared.interrupt import stages_that_are_kept
     from groma.cli.shared.mapping import WRITING
     from groma.execution import work_with
     from groma.features.images import one_opencv_thread
@@ -100,14 +100,9 @@ def localize(
     console.expect_compilation("localize")
     console.expect_stages(*DESCRIBING, LOCALIZING, WRITING)
     work = _output.work_folder(output)
-    try:
-        with interruptible() as interruption, console.stages() as stages, work_with(console.threads):
-            say = interruption.checking(stages)
-            localizer = Localizer(map_, images, options=options, progress=say)
-            found = localize_images(localizer, files, work, choice, say)
-    except KeyboardInterrupt:
-        words = f"finished queries are kept in {work}: the same command goes on from there."
-        raise typer.Exit(PROCESS.tell(words)) from None
+    with stages_that_are_kept(console, f"finished queries are kept in {work}") as say, work_with(console.threads):
+        localizer = Localizer(map_, images, options=options, progress=say)
+        found = localize_images(localizer, files, work, choice, say)
     if localizer.warning:
         console.warn(localizer.warning)
     result = LocalizeResult(localizer.scene, localizer.index, tuple(found))

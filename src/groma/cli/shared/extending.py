@@ -8,9 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-import typer
-
-from groma.cli.shared.interrupt import PROCESS
+from groma.cli.shared.interrupt import stages_that_are_kept
 from groma.cli.shared.output import work_folder
 from groma.errors import InputError, OutputError
 
@@ -129,15 +127,11 @@ def _localizer(
 
 
 def _with_progress(console: Console, made: Callable[[Callable[[str, int, int], None]], _Made], kept: str) -> _Made:
-    from groma.cli.shared.interrupt import interruptible
     from groma.execution import work_with
     from groma.features.images import one_opencv_thread
 
     if console.threads is not None:  # each photograph has one of them
         one_opencv_thread()
     console.expect_compilation("map")
-    try:
-        with interruptible() as interruption, console.stages() as stages, work_with(console.threads):
-            return made(interruption.checking(stages))
-    except KeyboardInterrupt:
-        raise typer.Exit(PROCESS.tell(f"{kept}: the same command goes on from there.")) from None
+    with stages_that_are_kept(console, kept) as say, work_with(console.threads):
+        return made(say)
