@@ -2,13 +2,17 @@
 """Rigs that are held and do not fit the images: told, with numbers; rigs that fit: nothing is said."""
 
 import re
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from groma.adjustment.adjust import AdjustOptions, adjust
+from groma.adjustment.uncertainty import pose_uncertainty
 from groma.geometry import quaternion, se3
 from groma.mapping.options import MapOptions
+from groma.mapping.result import MapResult
 from groma.mapping.surveyed import adjust_with_survey
 from groma.scene import Cameras, Scene
 from groma.scene.camera import CAMERA, Rigs, Sensors
@@ -84,3 +88,15 @@ def test_rigs_of_a_map_with_measurements_are_estimated_where_that_is_asked(refin
     found = adjust_with_survey(rig_scene(TURNED), MapOptions(refine_rigs=refined), say)
     off = 2.0 * np.degrees(np.arccos(min(abs(found.sensors.cam_from_rig[1, :4] @ MOUNTED[:4]), 1.0)))
     assert off < 0.1 if refined else off == pytest.approx(1.5)
+
+
+def test_a_map_counts_its_rig_among_what_was_estimated():
+    """Its cameras are known as the last adjustment knows them."""
+    for refined in (False, True):
+        told = AdjustOptions(refine_rigs=refined, loss="cauchy", loss_scale=4.0)
+        found = adjust(rig_scene(MOUNTED), told)
+        result: Any = SimpleNamespace(adjusted=found.scene, adjusted_with=told, report=found.report)
+        known = MapResult.pose_uncertainty(result)
+        expected = pose_uncertainty(found.scene, found.problem, found.report.sigma0, by_landmarks=True)
+        # Written to a scene and read again, poses differ in their last digits.
+        assert known["center"]["median"] == pytest.approx(expected["center"]["median"], rel=1e-6)

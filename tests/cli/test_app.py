@@ -31,6 +31,12 @@ def test_every_command_has_the_common_options(command, option, capsys):
     assert option in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("command", [*COMMANDS, ["evaluate", "lines"]], ids=" ".join)
+def test_every_command_takes_a_seed(command):
+    """Drawn or not: a script passes it to all of them."""
+    assert run([*command, "--seed", "1", "--help"]) == 0
+
+
 def test_the_list_of_commands_is_not_cut_off(capsys):
     for words in ([], ["evaluate"]):
         assert run([*words, "--help"]) == 0

@@ -107,19 +107,32 @@ def test_near_names_are_suggested(arguments, suggested, tmp_path, capsys):
         (["adjust", "HERE", "--sigma0", "2"], "--sigma0 acts only with --covariance"),
         (["adjust", "HERE", "--covariance-gauge", "held"], "--covariance-gauge acts only with --covariance"),
         (["adjust", "HERE", "--keep", "always"], "--keep acts only on a folder of parts"),
+        (["adjust", "HERE", "--refine-principal-point"], "--refine-principal-point acts only with --refine-intrinsics"),
+        (["adjust", "HERE", "--mark-sigma", "2"], "--mark-sigma belongs to --control"),
+        (["adjust", "PARTS", "-o", "OUT", "--protocol", "OUT"], "--protocol is for whole scenes"),
+        (["adjust", "PARTS", "-o", "OUT", "--keep-suspects"], "--keep-suspects is for whole scenes"),
         (["map", "HERE", "-o", "OUT", "--model", "HERE", "--mapper", "global"], "--mapper acts only without --model"),
         (["localize", "HERE", "HERE", "-o", "OUT", "--no-lines", "--min-length", "20"], "--min-length acts only with"),
         (["track", "HERE", "-o", "OUT", "--camera-model", "PINHOLE"], "belong together"),
         (["track", "HERE", "-o", "OUT", "--camera", "x", "--camera-model", "PINHOLE", "--camera-params", "1,1,1,1"],
          "exclude each other"),
         (["align", "HERE", "HERE", "--crs", "utm"], "--crs belongs to --positions or --control"),
+        (["localize", "HERE", "HERE", "-o", "OUT", "--calibration", "map", "--camera-model", "PINHOLE"],
+         "--calibration acts only without --camera-model"),
+        (["evaluate", "lines", "HERE", "--silhouettes", "HERE", "--align"], "--align acts only with a reference"),
+        (["evaluate", "lines", "HERE", "--silhouettes", "HERE", "--threshold", "1"], "--threshold acts only with a"),
+        (["evaluate", "trajectory", "TRACK", "TRACK", "--times", "TRACK"], "--times acts only on a REF without times"),
         (["selfcheck", "--runs", "3"], "--runs acts only with --nees"),
         (["view", "HERE", "--live", "--images", "HERE"], "--images acts only without --live"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )  # fmt: skip
 def test_options_that_would_do_nothing_are_refused(arguments, words, tmp_path, capsys):
-    places = {"HERE": tmp_path, "OUT": tmp_path / "out"}
+    places = {"HERE": tmp_path, "OUT": tmp_path / "out", "PARTS": tmp_path / "parts"}
+    places["PARTS"].mkdir()
+    (places["PARTS"] / "part-00000.npz").write_text("")
+    places["TRACK"] = tmp_path / "track.txt"
+    places["TRACK"].write_text("5 0 0 0 0 0 0 1\n")
     assert run([str(places.get(word, word)) for word in arguments]) == 1
     assert words in capsys.readouterr().err
 

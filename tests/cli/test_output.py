@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from groma.bounded.json_text import plain
-from groma.cli.shared.output import atomic_output, check_json, check_output, check_outputs, write_json
+from groma.cli.main import run
+from groma.cli.shared.output import atomic_output, check_json, check_output, check_outputs, work_folder, write_json
 from groma.errors import OutputError
 
 
@@ -55,6 +56,35 @@ def test_force_replaces_a_result_folder(tmp_path):
         (draft / "cameras.bin").write_text("new")
     assert os.listdir(tmp_path / "model") == ["cameras.bin"]
     assert os.listdir(tmp_path) == ["model"]
+
+
+@pytest.mark.parametrize("name", [".", "..", "../here"])
+def test_the_folder_that_one_is_in_is_not_replaced(tmp_path, monkeypatch, name):
+    """The shell would stand in a folder that is gone, and beside ``.`` there is no name for the finished stages."""
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    with pytest.raises(OutputError, match="the folder that you are in"):
+        check_output(Path(name), force=True)
+    assert run(["synth", "-o", name, "-n", "2", "--force"]) == 1
+    assert os.listdir(tmp_path) == ["here"] and os.listdir() == []
+
+
+def test_finished_work_is_not_kept_in_a_folder_of_somebody_else(tmp_path):
+    output, folder = tmp_path / "out", tmp_path / "out.work"
+    assert work_folder(output) == folder
+    folder.mkdir()
+    assert work_folder(output) == folder
+    for name in ("scene.npz", "now.npz"):  # of a track that was killed
+        (folder / name).write_text("")
+    assert work_folder(output) == folder
+    (folder / "thesis.tex").write_text("")
+    with pytest.raises(OutputError, match=r"out\.work is where finished work is kept .* Move it away"):
+        work_folder(output)
+    (folder / "lock").write_text("1\n")  # of a map, or of localised photographs
+    assert work_folder(output) == folder
+    (tmp_path / "file.work").write_text("")
+    with pytest.raises(OutputError, match="Move it away"):
+        work_folder(tmp_path / "file")
 
 
 def test_force_does_not_replace_a_folder_with_other_things(tmp_path):

@@ -45,6 +45,10 @@ def test_the_graph_is_adjusted_and_written(graph, tmp_path, capsys):
         (["-o", "OUT.txt"], "written as .g2o"),
         (["--covariance", "OUT.npz"], "--covariance is for scenes with images"),
         (["--report", "OUT.html"], "--report is for scenes with images"),
+        (["--protocol", "OUT.txt"], "--protocol is for scenes with images"),
+        (["--no-lines"], "--no-lines is for scenes with images"),
+        (["--diagnosis"], "--diagnosis is for scenes with images"),
+        (["--line-residual", "bearing"], "--line-residual is for scenes with images"),
         (["--loss", "nothing"], "no loss named 'nothing'"),
     ],
 )

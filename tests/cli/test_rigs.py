@@ -40,6 +40,8 @@ def asked(monkeypatch):
 def test_a_rig_is_found_in_the_folder_or_passed(tmp_path, photographs, asked, capsys):
     assert run(["map", "images", "-o", "out"]) == 1
     assert asked[-1].rigs == () and "rig" not in capsys.readouterr().out
+    assert run(["map", "images", "--refine-rig", "-o", "out"]) == 1
+    assert "--refine-rig acts only with --rig" in capsys.readouterr().err and len(asked) == 1
     (tmp_path / "other.json").write_text(photographs)
     assert run(["map", "images", "--rig", "other.json", "--refine-rig", "-o", "out"]) == 1
     assert len(asked[-1].rigs[0].cameras) == 2 and asked[-1].refine_rigs
@@ -48,6 +50,13 @@ def test_a_rig_is_found_in_the_folder_or_passed(tmp_path, photographs, asked, ca
     assert run(["map", "images", "-o", "out"]) == 1
     assert len(asked[-1].rigs) == 1 and not asked[-1].refine_rigs
     assert "Found in the folder: cameras on rigs" in capsys.readouterr().out
+
+
+def test_the_shortest_segment_is_that_of_detector_and_lines(photographs, asked):
+    """Segments shorter than usual were detected and not used; longer ones were expected where none was looked for."""
+    for length in (8.0, 30.0):
+        assert run(["map", "images", "-o", "out", "--min-length", str(length)]) == 1
+        assert asked[-1].min_segment_length == asked[-1].lines.min_length == length
 
 
 def test_a_model_has_its_own_rigs(tmp_path, photographs, asked, capsys):

@@ -12,12 +12,17 @@ from groma.io import sequences
 from groma.tracking import sequence
 
 
-@pytest.mark.parametrize(("baseline", "threads"), [(None, 1), (0.1, 2)])
-def test_opencv_has_threads_of_its_own_for_pairs_alone(tmp_path, monkeypatch, baseline, threads):
-    seen = []
+@pytest.mark.parametrize(
+    ("baseline", "asked", "seen"),
+    [(None, [], (1, True)), (0.1, [], (2, True)), (0.1, ["--threads", "2"], (2, True)),
+     (0.1, ["--threads", "1"], (1, False))],
+)  # fmt: skip
+def test_opencv_has_threads_of_its_own_for_pairs_alone(tmp_path, monkeypatch, baseline, asked, seen):
+    """And with ``--threads 1`` nobody has any."""
+    found = []
 
-    def look(*arguments, **options):
-        seen.append(cv2.getNumThreads())
+    def look(frames, options, *arguments, **others):
+        found.append((cv2.getNumThreads(), options.threaded))
         raise InputError("enough was seen")
 
     (tmp_path / "frames").mkdir()
@@ -27,7 +32,7 @@ def test_opencv_has_threads_of_its_own_for_pairs_alone(tmp_path, monkeypatch, ba
     before = cv2.getNumThreads()
     cv2.setNumThreads(2)
     try:
-        assert run(["track", str(tmp_path / "frames"), "-o", str(tmp_path / "out")]) == 1
+        assert run(["track", str(tmp_path / "frames"), "-o", str(tmp_path / "out"), *asked]) == 1
     finally:
         cv2.setNumThreads(before)
-    assert seen == [threads]
+    assert found == [seen]

@@ -14,12 +14,9 @@ import pytest
 import groma
 from groma.adjustment.adjust import AdjustOptions
 from groma.adjustment.report import why_steps_ran_out
-from groma.adjustment.stages import STAGES
 from groma.cli.main import run
 from groma.errors import ProblemError
-from groma.factors.losses import Cauchy, GemanMcClure, Huber
 from groma.io import read_scene, write_scene
-from groma.mapping.result import last_loss
 from groma.scene import Relations
 
 pytestmark = pytest.mark.kernels
@@ -66,7 +63,7 @@ def test_a_map_is_diagnosed_at_its_own_noise(scenes):
     scene = read_scene(scenes / "truth.npz").replace(relations=Relations())  # these have a noise of their own
     weakness = []
     for sigma in (20.0, 10.0):
-        told = AdjustOptions(point_sigma_px=sigma, line_sigma_px=sigma)
+        told = AdjustOptions(point_sigma_px=sigma, line_sigma_px=sigma, loss_scale=6.0)
         result: Any = SimpleNamespace(num_photographs=0, scene=scene, adjusted_with=told)
         weakness.append(MapResult.diagnose(result).weakness["points"])
     # The loss, which is twelve times as wide as the noise, takes hardly anything off residuals of half a pixel.
@@ -183,9 +180,3 @@ def test_steps_that_run_out_along_what_is_open_say_so(here, capsys):
     }
     assert why_steps_ran_out(slow) == []
     assert why_steps_ran_out(slow | {"diagnosis": {"num_unobservable_directions": 2}}) == ran_out
-
-
-def test_a_map_is_diagnosed_with_its_last_loss():
-    assert last_loss(AdjustOptions(loss="cauchy", loss_scale=4.0)) == Cauchy(4.0)
-    assert last_loss(AdjustOptions(loss="huber")) == Huber(1.0)
-    assert last_loss(AdjustOptions()) == GemanMcClure(STAGES.last_scale)

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+from groma.adjustment.adjust import AdjustOptions
 from groma.cli.main import run
 from groma.errors import InputError, OutputError
 from groma.evaluation import cabinet
@@ -19,13 +20,15 @@ from groma.geometry import so3
 from groma.io import read_scene, write_scene
 from groma.localization import extension
 from groma.localization.calibration import CalibrationChoice
-from groma.localization.extension import extended_model
+from groma.localization.extension import extended_model, in_world_of
 from groma.localization.joining.merging import _line_sigma, _one_to_one, _same_lines, merged_model
 from groma.localization.localizer import Localizer
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.posed_model import gather_photographs
-from groma.scene import LineObservations, Similarity
+from groma.mapping.result import MapResult
+from groma.scene import CameraPositions, Distances, LineObservations, Similarity
 from groma.scene.landmarks import Lines
+from groma.scene.survey import Kind
 
 FRAMES = [f"{number:04d}.jpg" for number in range(24, 36)]
 HALVES = {"a": FRAMES[0::2], "b": FRAMES[1::2]}
@@ -58,6 +61,18 @@ def place(tmp_path_factory, truth):
 @pytest.fixture(scope="module")
 def maps(place):
     return {half: Localizer(place / f"{half}.npz", place / half) for half in HALVES}
+
+
+def test_photographs_that_the_map_has_are_left_out(maps, place, tmp_path):
+    """A folder to which photographs were added is passed as a whole; old ones would be in the map twice."""
+    files = {name: place / half / name for half in HALVES for name in HALVES[half]}
+    choice = CalibrationChoice()
+    made = extended_model(maps["a"], files, tmp_path / "work", tmp_path / "images", choice, quiet)
+    assert sorted(made.scene.images.names) == FRAMES
+    assert made.warnings() == ["Left out, as the map has them already: 6 photographs."]
+    files = {name: place / "a" / name for name in HALVES["a"]}
+    with pytest.raises(InputError, match="The map has all of the 6 photographs already"):
+        extended_model(maps["a"], files, tmp_path / "work", tmp_path / "images", choice, quiet)
 
 
 def _off(scene, truth):
@@ -113,6 +128,29 @@ def test_photographs_of_something_else_are_left_out(maps, place, tmp_path):
         extended_model(
             maps["a"], {"blank.png": files["blank.png"]}, tmp_path / "w", tmp_path / "i", CalibrationChoice(), quiet
         )
+
+
+@pytest.mark.parametrize(
+    ("measured", "expected"),
+    [
+        ({}, MOVED),
+        # A distance knows its length, and a measured place is where it is.
+        ({"distances": Distances.between(Kind.IMAGE, [0], [5], [1.0], [0.01])}, Similarity(1.0, MOVED.rotation)),
+        ({"camera_positions": CameraPositions([0], np.zeros((1, 3)), np.eye(3)[None])}, Similarity()),
+    ],
+    ids=["nothing", "distance", "place"],
+)
+def test_what_was_measured_stays_where_a_map_is_extended(truth, measured, expected):
+    scene = truth.replace(**measured)
+    report = SimpleNamespace(warnings=())
+    made: Any = MapResult(scene, scene, scene, scene, report, AdjustOptions(), {}, "", {}, ())  # type: ignore[arg-type]
+    found = in_world_of(made, truth.transformed(MOVED)).scene
+    turned = Similarity(expected.scale, expected.rotation).points(truth.points.xyz)
+    away = found.points.xyz - turned
+    np.testing.assert_allclose(away - away[0], 0.0, atol=1e-6 * np.ptp(turned))
+    for name, table in measured.items():
+        column = "distance" if name == "distances" else "xyz"
+        np.testing.assert_allclose(getattr(getattr(found, name), column), getattr(table, column))
 
 
 def test_two_maps_are_joined_with_their_scale(maps, truth, tmp_path):

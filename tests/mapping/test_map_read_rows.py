@@ -66,6 +66,9 @@ def test_a_map_of_known_points_lies_on_the_walls(rendered, tmp_path):
     found = map_images(folder, tmp_path / "rows", with_rolling_shutter(truth), told)  # the scene says it
     assert np.median(off_walls(found.scene)) < 0.5 * np.median(off_walls(still.scene))
     assert found.scene.num_lines > 2 * still.scene.num_lines
+    # Words and numbers are of one problem.
+    assert all(sentence in found.explanation for sentence in found.motions().sentences())
+    assert set(found.motions().warnings()) <= set(found.warnings)
 
 
 def test_what_was_measured_comes_back(rendered):

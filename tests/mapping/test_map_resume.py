@@ -21,6 +21,9 @@ from groma.io.colmap.sfm import PointModelOptions, reconstruct_points
 from groma.mapping import map as mapping
 from groma.mapping.checkpoint_files import SCENE
 from groma.mapping.checkpoints import Stages, digest, has_stages, remove_stages, stage
+from groma.mapping.map import MapOptions
+from groma.mapping.read_rows import adjust_as_measured, adjust_read_rows
+from groma.mapping.surveyed import adjust_with_survey
 
 posix = pytest.mark.skipif(os.name == "nt", reason="signals of POSIX systems")
 
@@ -45,6 +48,32 @@ def test_stages_are_made_once_and_again_when_something_before_them_changes(tmp_p
     with Stages(tmp_path / "work", digest("other input"), 1) as stages:
         assert compare.equal(stages.run(make("a"), model), model)
     assert made[7:] == ["a", "a"]
+
+
+@pytest.mark.parametrize(
+    ("kept", "option"),
+    [
+        (adjust_read_rows, {"rolling_shutter": "columns"}),
+        (adjust_read_rows, {"refine_poses": False}),
+        (adjust_read_rows, {"refine_intrinsics": True}),
+        (adjust_read_rows, {"refine_rigs": True}),
+        (adjust_read_rows, {"max_iterations": 5}),
+        (adjust_with_survey, {"keep_suspects": True}),
+        (adjust_as_measured, {"min_confidence": 0.0}),
+    ],
+)
+def test_a_stage_is_made_again_where_an_option_of_its_own_has_changed(kept, option):
+    assert kept.depends(MapOptions()) != kept.depends(MapOptions(**option))
+
+
+def test_objects_are_told_apart_by_what_they_hold():
+    """A detector of another package need not be a dataclass; its address says nothing, and may come again."""
+
+    class Detector:
+        def __init__(self, length):
+            self.length, self.network = length, object()
+
+    assert digest(Detector(12.0)) == digest(Detector(12.0)) != digest(Detector(20.0))
 
 
 @pytest.mark.parametrize("workers", [1, 2])

@@ -149,6 +149,16 @@ def test_segments_in_the_images(tmp_path):
     assert first["lines_seen"] == second["lines_seen"] == 4
 
 
+def test_photographs_stand_in_the_order_of_their_names(tmp_path):
+    """Whatever that of a model; what was measured in each goes with it."""
+    scene = exact_scene()
+    data = data_of(write_page(tmp_path, None, scene.replace(images=scene.images.replace(names=("10.jpg", "9.jpg")))))
+    assert [(entry["name"], entry["camera"]) for entry in data["images"]] == [("9.jpg", 1), ("10.jpg", 0)]
+    begin, end = data["images"][0]["segments"]
+    seen = scene.line_observations.segment[scene.line_observations.image_idx == 1]
+    np.testing.assert_allclose(_floats(data["segments"]).reshape(-1, 8)[begin:end, :4], seen, rtol=1e-6)
+
+
 def test_lines_keep_all_their_segments_when_there_are_too_many(tmp_path, monkeypatch):
     monkeypatch.setattr(_page_kept, "MAX_SEGMENT_ROWS", 5)
     data = data_of(write_page(tmp_path, None, exact_scene()))

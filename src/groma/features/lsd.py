@@ -68,23 +68,13 @@ class LsdDetector:
         if detected is None or np.size(detected) == 0:
             return Segments.empty()
         ends = np.asarray(detected, dtype=np.float64).reshape(-1, 4) + 0.5 / self.scale
-        ends = _keep_long(ends, min(self.min_length, MERGES.min_piece) if self.merge else self.min_length)
+        shortest = min(self.min_length, MERGES.min_piece) if self.merge else self.min_length
+        ends = ends[np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1]) >= shortest]
         smooth = smoothed(gray)
         ends, sigma, strength = measure_smoothed(smooth, ends, fit=self.fit)
         if self.merge:
             merged = merge_collinear(ends)
             if len(merged) < len(ends):
                 ends, sigma, strength = measure_smoothed(smooth, merged, fit=self.fit)
-        height, width = gray.shape
-        limit = np.array([width, height, width, height], dtype=np.float64)
-        ends = np.clip(ends, 0.0, limit)
-        length = np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1])
-        rows = np.flatnonzero((length >= self.min_length) & (strength >= self.min_strength))
-        rows = rows[np.lexsort((ends[rows, 1], ends[rows, 0], -length[rows]))]
-        if self.max_segments:
-            rows = rows[: self.max_segments]
-        return Segments(ends[rows], sigma[rows], strength[rows])
-
-
-def _keep_long(ends: npt.NDArray[np.float64], shortest: float) -> npt.NDArray[np.float64]:
-    return ends[np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1]) >= shortest]
+        found = Segments.ranked(ends, sigma, strength, gray.shape, self.min_length, self.min_strength)
+        return found.select(np.arange(len(found))[: self.max_segments or len(found)])

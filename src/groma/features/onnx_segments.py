@@ -106,14 +106,9 @@ class OnnxDetector:
         merged = merge_collinear(ends)
         if len(merged) < len(ends):
             ends, sigma, strength = measure_edges(gray, merged)
-        ends = np.clip(ends, 0.0, np.array(gray.shape[::-1] * 2, np.float64))
-        length = np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1])
-        rows = np.flatnonzero((length >= self.min_length) & (strength >= self.min_strength))
-        rows = rows[np.lexsort((ends[rows, 1], ends[rows, 0], -length[rows]))]
-        rows = rows[~covered(ends[rows])]
-        if self.max_segments:
-            rows = rows[: self.max_segments]
-        return Segments(ends[rows], sigma[rows], strength[rows])
+        found = Segments.ranked(ends, sigma, strength, gray.shape, self.min_length, self.min_strength)
+        rows = np.flatnonzero(~covered(found.ends))
+        return found.select(rows[: self.max_segments or len(rows)])
 
 
 def covered(ends: FloatArray) -> BoolArray:

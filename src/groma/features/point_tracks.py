@@ -185,11 +185,12 @@ def spread(
     return order[np.sort(first)][:count]
 
 
-def corners(image: GrayImage, count: int, distance: float, mask: GrayImage | None = None) -> FloatArray:
+def corners(image: GrayImage, count: int, distance: float) -> FloatArray:
     """Corners (Shi and Tomasi) that noise does not explain, (N, 2) pixels, strongest first."""
     gates = POINT_TRACKS
-    settings: dict = {"mask": mask, "blockSize": gates.block}
-    found, strength = cv2.goodFeaturesToTrackWithQuality(image, count, gates.quality, distance, **settings)
+    found, strength = cv2.goodFeaturesToTrackWithQuality(
+        image, count, gates.quality, distance, None, blockSize=gates.block
+    )
     if found is None:
         return np.zeros((0, 2))
     at, strength = found.reshape(-1, 2), strength.ravel()

@@ -78,6 +78,21 @@ class Segments:
         return Segments(self.ends[rows], self.sigma[rows], self.strength[rows])
 
     @staticmethod
+    def ranked(
+        ends: FloatArray, sigma: FloatArray, strength: FloatArray, size: tuple[int, ...], min_length: float,
+        min_strength: float,
+    ) -> Segments:  # fmt: skip
+        """Segments cut off at the border of an image of a size (height, width), the longest first.
+
+        Those that are shorter or weaker than wanted are left out.
+        """
+        ends = np.clip(ends, 0.0, np.array(size[::-1] * 2, np.float64))
+        length = np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1])
+        rows = np.flatnonzero((length >= min_length) & (strength >= min_strength))
+        rows = rows[np.lexsort((ends[rows, 1], ends[rows, 0], -length[rows]))]
+        return Segments(ends[rows], sigma[rows], strength[rows])
+
+    @staticmethod
     def from_ends(ends: FloatArray, sigma: float = 0.3) -> Segments:
         """Segments from end points (N, 4) of another detector, with one sigma in pixels for all.
 

@@ -3,16 +3,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from groma._counted import counted
 from groma.errors import InputError
 from groma.evaluation.alignment import align_poses
 from groma.localization.calibration import CalibrationChoice
 from groma.localization.localizer import Localizer
+from groma.localization.map_images import content_digest
 from groma.localization.map_index import Progress
 from groma.localization.placed import PlacedImage
 from groma.localization.posed_model import gather_photographs, with_photographs
@@ -33,16 +36,21 @@ class ExtendedModel:
     map: Scene
     #: What became of the new ones.
     queries: tuple[PlacedImage, ...]
+    #: Photographs that the map has already.
+    num_known: int = 0
 
     def warnings(self) -> list[str]:
         """Say which photographs are left out."""
+        known = [f"Left out, as the map has them already: {counted(self.num_known, 'photographs')}."]
+        known = known if self.num_known else []
         left = [one for one in self.queries if one.status != "localized"]
         if not left:
-            return []
+            return known
         named = "; ".join(f"{one.name} ({one.status}: {one.sentence})" for one in left[:3])
         more = f"; and {len(left) - 3} more" if len(left) > 3 else ""
         return [
-            f"Left out, as the map does not tell where: {len(left)} of {len(self.queries)} photographs. {named}{more}"
+            *known,
+            f"Left out, as the map does not tell where: {len(left)} of {len(self.queries)} photographs. {named}{more}",
         ]
 
 
@@ -61,7 +69,7 @@ def extended_model(
     localizer
         The map.
     files
-        The new photographs by name.
+        The new photographs by name; those that the map has are left out.
     work
         Folder where localised ones are kept.
     folder
@@ -74,8 +82,11 @@ def extended_model(
     Raises
     ------
     InputError
-        If no photograph is found in the map.
+        If no photograph is found in the map, or it has all of them already.
     """
+    num_given, files = len(files), _without_known(files, localizer.files)
+    if not files:
+        raise InputError(f"The map has all of the {counted(num_given, 'photographs')} already. Pass new ones.")
     before, done = localizer.scene, dict[str, PlacedImage]()
     waiting, scene = dict(files), localizer.scene
     for turn in range(len(files)):
@@ -94,16 +105,32 @@ def extended_model(
             break
         # What shows nothing of the map may show what the photographs do that are in it now.
         localizer = Localizer(scene, folder, options=localizer.options, progress=say)
-    return ExtendedModel(scene, folder, before, tuple(done[name] for name in files))
+    return ExtendedModel(scene, folder, before, tuple(done[name] for name in files), num_given - len(files))
+
+
+def _without_known(files: Mapping[str, Path], known: Sequence[Path]) -> dict[str, Path]:
+    """Return the photographs whose content is that of none of some others; those that cannot be read are kept."""
+    digests, fresh = {content_digest(path) for path in known}, dict(files)
+    for name, path in files.items():
+        with suppress(OSError):
+            if content_digest(path) in digests:
+                del fresh[name]
+    return fresh
 
 
 def in_world_of(result: MapResult, before: Scene) -> MapResult:
-    """Return a map in the world of the one that it extends, by the poses of the images that both have."""
+    """Return a map in the world of the one that it extends, by the poses of the images that both have.
+
+    Where measurements say where it is, it is there; where they tell its scale, that stays.
+    """
     place = {name: row for row, name in enumerate(result.scene.images.names)}
     both = [(place[name], row) for row, name in enumerate(before.images.names) if name in place]
-    if len(both) < 2:
+    scene = result.scene
+    placed = scene.camera_positions, scene.camera_poses, scene.control_points, scene.pose_priors
+    if len(both) < 2 or scene.is_tied or any(map(len, placed)):
         return result
     now, then = np.array(both).T
-    moved: Similarity = align_poses(result.scene.cam_from_world[now], before.cam_from_world[then])
+    poses = scene.cam_from_world[now], before.cam_from_world[then]
+    moved: Similarity = align_poses(*poses, with_scale=not scene.has_scale)
     scenes = {name: getattr(result, name).transformed(moved) for name in ("scene", "before", "adjusted")}
     return replace(result, **scenes)

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from groma._log import logged_stages, logger_of
+from groma._version import __version__
 from groma.bounded.names import IMAGES
 from groma.errors import GromaError, InputError
 from groma.execution import map_work
@@ -65,7 +66,7 @@ def localize_images(
         Called with the name of a stage, what is done and what there is to do.
     """
     say, choice = logged_stages("localization", progress), choice or CalibrationChoice()
-    told = f"{digest_of(localizer.scene, localizer.files)} {localizer.options} {choice}"
+    told = f"{__version__} {digest_of(localizer.scene, localizer.files)} {localizer.options} {choice}"
     with lock_folder(work), one_blas_thread():
         one = partial(_kept, localizer, choice, work, told)
         return map_work(one, list(files.items()), partial(say, "localising photographs"))

@@ -32,7 +32,10 @@ _KEY_LENGTH = 12
 
 
 def digest(*parts: object) -> str:
-    """Return the hash of values: arrays by their content, dataclasses, mappings and sequences by theirs."""
+    """Return the hash of values: arrays by their content, dataclasses, mappings and sequences by theirs.
+
+    Of other objects it is what they say of themselves, else their class and what they hold.
+    """
     state = hashlib.sha256()
     _feed(state.update, parts)
     return state.hexdigest()
@@ -43,7 +46,7 @@ def _feed(update: Callable[[bytes], None], value: Any) -> None:
         update(f"{value.dtype}{value.shape}".encode())
         update(np.ascontiguousarray(value).tobytes())
     elif is_dataclass(value) and not isinstance(value, type):
-        update(f"{type(value).__module__}.{type(value).__qualname__}".encode())
+        update(_name(value).encode())
         _feed(update, {item.name: getattr(value, item.name) for item in fields(value)})
     elif isinstance(value, Mapping):
         _feed(update, sorted(value.items(), key=lambda item: repr(item[0])))
@@ -51,8 +54,19 @@ def _feed(update: Callable[[bytes], None], value: Any) -> None:
         update(f"[{len(value)}".encode())
         for item in value:
             _feed(update, item)
+    elif _is_plain(value):  # says but where it lies in memory
+        held = getattr(value, "__dict__", {})
+        _feed(update, [_name(value), {name: _name(one) if _is_plain(one) else one for name, one in held.items()}])
     else:
         update(repr(value).encode() + b"\0")
+
+
+def _is_plain(value: Any) -> bool:
+    return type(value).__repr__ is object.__repr__ and not is_dataclass(value)
+
+
+def _name(value: Any) -> str:
+    return f"{type(value).__module__}.{type(value).__qualname__}"
 
 
 def digest_files(folder: Path, files: list[Path]) -> str:

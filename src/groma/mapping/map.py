@@ -242,10 +242,10 @@ def map_segments(
 
 
 # --------------------------------------------------------------------------------------------------------------- stages
-@stage("points", SCENE, lambda o: (o.refine_poses, o.refine_intrinsics, o.refine_rigs, o.max_iterations))
+@stage("points", SCENE, lambda options: options.adjustment(threads=False))
 def adjust_points(start: Scene, options: MapOptions, say: StageProgress) -> Scene:
     """A model whose poses and points are adjusted with robust losses."""
-    return _adjusted(start, _robust(options), say, "adjusting points").scene
+    return _adjusted(start, options.adjustment(), say, "adjusting points").scene
 
 
 @stage("measured", SCENE)
@@ -257,7 +257,7 @@ def measure_points(folder: Path, points: Scene, options: MapOptions, say: StageP
         noise_px(points, "points"),
         partial(say, "measuring points"),
     )
-    weighted = dataclasses.replace(_robust(options), point_sigma_px=found.sigma_px)
+    weighted = dataclasses.replace(options.adjustment(), point_sigma_px=found.sigma_px)
     return _adjusted(found.scene, weighted, say, "adjusting points again").scene
 
 
@@ -309,24 +309,11 @@ def adjust_everything(scene: Scene, weighted: AdjustOptions, options: MapOptions
 
 
 # -------------------------------------------------------------------------------------------------------------- helpers
-def _robust(options: MapOptions) -> AdjustOptions:
-    """Options of an adjustment of which the scene alone is wanted: the last one asks what the lenses lack."""
-    return AdjustOptions(
-        refine_poses=options.refine_poses,
-        refine_intrinsics=bool(options.refine_intrinsics),
-        refine_rigs=options.refine_rigs,
-        max_iterations=options.max_iterations,
-        start_tolerance=0.0,
-        check_lens=False,
-        threads=options.threads,
-    )
-
-
 def _weighted(scene: Scene, options: MapOptions) -> AdjustOptions:
     """Options that weigh points and lines by the noise they have in a scene."""
     correlation = line_end_correlation(scene)
     return dataclasses.replace(
-        _robust(options),
+        options.adjustment(),
         point_sigma_px=noise_px(scene, "points"),
         line_sigma_px=noise_px(scene, "lines", correlation),
         line_end_correlation=correlation,

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from groma.adjustment.adjust import AdjustOptions
 from groma.features.contract import ImageRetrieval, SegmentDetector, SegmentMatcher
 from groma.io.colmap.rigs import RigDescription
 from groma.io.colmap.sfm import PointModelOptions
@@ -21,7 +22,7 @@ StageProgress = Callable[[str, int, int], None]
 class MapOptions:
     """Options of :func:`groma.map_images`."""
 
-    #: Shortest segment, pixels.
+    #: Shortest segment that is looked for, pixels; ``lines.min_length`` is that of one that is used.
     min_segment_length: float = MIN_LENGTH
     #: What finds the segments: an object, or a name of :data:`groma.features.registry.DETECTORS`.
     detector: str | SegmentDetector = "lsd"
@@ -67,3 +68,15 @@ class MapOptions:
         """How points are reconstructed, with or without the number of threads, on which no result depends."""
         lens, count = (self.camera_model or "SIMPLE_RADIAL", self.camera_params), self.threads if threads else None
         return PointModelOptions(*lens, self.seed, count, self.mapper, self.rigs, self.refine_rigs)
+
+    def adjustment(self, threads: bool = True) -> AdjustOptions:
+        """How stages adjust of which the scene alone is wanted: the last one asks what the lenses lack."""
+        return AdjustOptions(
+            refine_poses=self.refine_poses,
+            refine_intrinsics=bool(self.refine_intrinsics),
+            refine_rigs=self.refine_rigs,
+            max_iterations=self.max_iterations,
+            start_tolerance=0.0,
+            check_lens=False,
+            threads=self.threads if threads else None,
+        )

@@ -23,7 +23,6 @@ from groma.adjustment.rolling_shutter import (
     AXES,
     NOT_ROLLING,
     adjust_rolling_shutter,
-    motions_of,
     with_rolling_shutter,
 )
 from groma.adjustment.terms.readout import motion_of, offsets_of
@@ -80,21 +79,15 @@ def read_by_rows(scene: Scene, options: MapOptions, depth: object = None) -> boo
     return rolling
 
 
-@stage("rows", SCENE)
+@stage("rows", SCENE, lambda options: (options.rolling_shutter, options.adjustment(threads=False)))
 def adjust_read_rows(start: Scene, options: MapOptions, say: Callable[[str, int, int], None]) -> Scene:
     """A model whose poses, points and motions during the readout, if there are some, are adjusted robustly."""
-    told = AdjustOptions(
-        refine_intrinsics=bool(options.refine_intrinsics),
-        refine_rigs=options.refine_rigs,
-        refine_poses=options.refine_poses,
-        max_iterations=options.max_iterations,
-        check_lens=False,
-        threads=options.threads,
-    )
     if options.rolling_shutter is not None:
         start = with_rolling_shutter(start, options.rolling_shutter)
     found = adjust_rolling_shutter(
-        start, told, lambda event: say("adjusting points and motions", event.iteration, event.max_iterations)
+        start,
+        options.adjustment(),
+        lambda event: say("adjusting points and motions", event.iteration, event.max_iterations),
     )
     return found.result.scene
 
@@ -143,20 +136,24 @@ def mapped_as_measured(result: MapResult, at_once: TakenAtOnce, stages: Stages[M
         return replace(result, warnings=(*result.warnings, NOT_ROLLING)) if asked else result
     before = as_measured(result.scene, at_once)
     adjusted = stages.run(adjust_as_measured, before, result.adjusted_with)
-    motions = motions_of(adjusted.scene, adjusted.problem)
-    return replace(
+    result = replace(
         result,
         scene=adjusted.scene,
         start=at_once.points,
         before=before,
         adjusted=adjusted.scene,
         report=adjusted.report,
+    )
+    motions = result.motions()
+    return replace(
+        result,
         explanation=" ".join([*motions.sentences(), result.explanation]),
         warnings=(*result.warnings, *motions.warnings()),
     )
 
 
-@stage("as-measured", ADJUSTED)
+# The map that it begins from has lost the lines that are probably wrong.
+@stage("as-measured", ADJUSTED, lambda options: options.min_confidence)
 def adjust_as_measured(
     scene: Scene, weighted: AdjustOptions, options: MapOptions, say: Callable[[str, int, int], None]
 ) -> AdjustResult:

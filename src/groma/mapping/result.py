@@ -13,21 +13,19 @@ from typing import Any
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.adjustment.adjust import AdjustOptions
+from groma.adjustment.adjust import AdjustOptions, assembly_options_of, losses_of, relation_loss_of
 from groma.adjustment.assemble import assemble
-from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.contributions import Contribution, contributions
 from groma.adjustment.diagnosis import diagnose_scene
 from groma.adjustment.report import AdjustReport, AdjustResult
-from groma.adjustment.rolling_shutter import motions_of
-from groma.adjustment.stages import STAGES, with_loss
+from groma.adjustment.rolling_shutter import Motions, motions_of
+from groma.adjustment.stages import with_loss
 from groma.adjustment.survey.attach import Surveyed
 from groma.adjustment.survey.gross_errors import reliability_of
 from groma.adjustment.survey.protocol import protocol
 from groma.adjustment.uncertainty import pose_uncertainty
 from groma.bounded.json_text import json_text
 from groma.execution import beside
-from groma.factors.losses import GemanMcClure, Loss, loss
 from groma.io import atomic_output, write_geometry, write_scene
 from groma.mapping.depth.points import MeasuredDepths
 from groma.mapping.lines.confidence import line_confidence
@@ -129,12 +127,15 @@ class MapResult:
         if self.depths is not None:
             numbers["depth"] = self.depths.to_dict()
         if len(self.scene.camera_motions):
-            problem = _problem_of(self.scene, self.adjusted_with)
-            numbers["rolling_shutter"] = motions_of(self.scene, problem).to_dict()
+            numbers["rolling_shutter"] = self.motions().to_dict()
         if self.scene.has_survey or len(self.scene.pose_priors):
             found = reliability_of(self.scene, _problem_of(self.scene, self.adjusted_with))
             numbers["survey"] = survey_numbers(self.surveyed, found, self.scene)
         return numbers
+
+    def motions(self) -> Motions:
+        """Return how the cameras moved while images were read, and how well the last adjustment tells."""
+        return motions_of(self.scene, _problem_of(self.scene, self.adjusted_with))
 
     def photographs(self, images: ImageFiles | None) -> Photographs:
         """Begin to read the photographs for the page of :meth:`write`; other work goes on meanwhile."""
@@ -216,23 +217,9 @@ def _confidence_numbers(confidence: FloatArray) -> dict[str, Any]:
 
 def _problem_of(scene: Scene, told: AdjustOptions) -> Problem:
     """Return the problem of the last adjustment at its solution."""
-    assembly = AssemblyOptions(
-        point_sigma_px=told.point_sigma_px,
-        line_sigma_px=told.line_sigma_px,
-        line_end_correlation=told.line_end_correlation,
-        structure_sigma_px=told.structure_sigma_px,
-        refine_poses=told.refine_poses,
-        refine_intrinsics=bool(told.refine_intrinsics),
-    )
-    problem, ended_with = assemble(scene, assembly).problem, last_loss(told)
-    return with_loss(problem, ended_with, line_loss_factor=told.line_loss_factor)
-
-
-def last_loss(told: AdjustOptions) -> Loss:
-    """Return the loss that an adjustment of photographs ends with."""
-    if told.loss == "auto":
-        return GemanMcClure(STAGES.last_scale)
-    return loss(told.loss, 1.0 if told.loss_scale is None else told.loss_scale)
+    last_loss, relation_loss = losses_of(scene, told)[-1], relation_loss_of(scene, told)
+    problem = assemble(scene, assembly_options_of(scene, told, last_loss, relation_loss)).problem
+    return with_loss(problem, last_loss, relation_loss, told.line_loss_factor)
 
 
 def result_of(

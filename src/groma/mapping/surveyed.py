@@ -134,21 +134,14 @@ def tied(start: Scene, points: Scene, survey: Survey) -> Tied:
     return Tied(surveyed, start, points, near)
 
 
-@stage("surveyed", SCENE)
+@stage("surveyed", SCENE, lambda options: options.keep_suspects)
 def adjust_with_survey(points: Scene, options: Any, say: Callable[[str, int, int], None]) -> Scene:
     """Points and poses adjusted with measurements of other instruments, weighted by their noise."""
-    told = AdjustOptions(
-        refine_poses=options.refine_poses,
-        refine_intrinsics=bool(options.refine_intrinsics),
-        refine_rigs=options.refine_rigs,
-        max_iterations=options.max_iterations,
-        threads=options.threads,
-    )
 
     def tell(event: Progress) -> None:
         say("adjusting with measurements", event.iteration, event.max_iterations)
 
-    told = weighted(points, told)
+    told = weighted(points, options.adjustment())
     if options.keep_suspects:
         return adjust(with_rejected(points, ()), told, tell).scene
     return without_gross_errors(adjust(points, told, tell), lambda scene: adjust(scene, told, tell))[0].scene

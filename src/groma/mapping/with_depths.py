@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 from groma._typing import FloatArray
-from groma.adjustment.adjust import AdjustOptions, adjust
+from groma.adjustment.adjust import adjust
 from groma.adjustment.report import Progress
 from groma.features.segments import Segments
 from groma.io.depth_maps import DepthMaps
@@ -65,16 +65,7 @@ def find_depths(points: Scene, maps: DepthMaps, known: float | None, options: An
 @stage("points-with-depths", SCENE)
 def adjust_with_depths(points: Scene, options: Any, say: _Say) -> Scene:
     """Points and poses adjusted with the depths of points."""
-    told = AdjustOptions(
-        point_sigma_px=noise_px(points, "points"),
-        refine_poses=options.refine_poses,
-        refine_intrinsics=bool(options.refine_intrinsics),
-        refine_rigs=options.refine_rigs,
-        max_iterations=options.max_iterations,
-        start_tolerance=0.0,
-        check_lens=False,
-        threads=options.threads,
-    )
+    told = replace(options.adjustment(), point_sigma_px=noise_px(points, "points"))
 
     def tell(event: Progress) -> None:
         say("adjusting with depths", event.iteration, event.max_iterations)

@@ -22,6 +22,8 @@ from groma.errors import FileFormatError
 Picture = npt.NDArray[np.uint8]
 #: A folder of images, or image files by the names that the scene gives them.
 ImageFiles = str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]]
+#: Of JPEG (cost: bytes of a page).
+_QUALITY = 78
 
 
 def image_file(images: ImageFiles | None, name: str) -> Path | None:
@@ -92,11 +94,11 @@ def read_picture(path: str | os.PathLike[str], max_size: int | None = None) -> P
     return np.ascontiguousarray(picture[..., ::-1], dtype=np.uint8)
 
 
-def data_address(picture: Picture, quality: int = 78) -> str:
+def data_address(picture: Picture) -> str:
     """Return a picture as the address of a JPEG that is its own content."""
     import cv2
 
-    encoded = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    encoded = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
     return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
 
 

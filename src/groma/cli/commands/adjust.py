@@ -168,7 +168,6 @@ def adjust(
     contributions: _options.Contributions = False,
     truth: _options.Truth = None,
     force: _options.Force = False,
-    seed: _options.NoSeed = 0,
 ) -> None:
     """Adjust cameras, points, lines and planes together (bundle adjustment).
 
@@ -200,14 +199,24 @@ def adjust(
         ("--covariance-gauge", covariance_gauge != "auto" and covariance is None, "with --covariance"),
         ("--sigma0", sigma0 != 1.0 and covariance is None, "with --covariance"),
         ("--keep", keep != "auto" and not in_parts, "on a folder of parts"),
+        (
+            "--refine-principal-point",
+            refine_principal_point and not (refine_intrinsics or camera_model),
+            "with --refine-intrinsics",
+        ),
     )
+    refused = {  # by what is no scene with images as a whole
+        "--report": page, "--covariance": covariance, "--protocol": protocol, "--contributions": contributions,
+        "--diagnosis": diagnosis, "--camera-model": camera_model, "--rolling-shutter": rolling_shutter,
+        "--keep-suspects": measured.keep_suspects, **measured.given,
+    }  # fmt: skip
     if not in_parts:
         check_inputs(source, truth, *measured.files)
     if not in_parts and is_g2o(source):
-        refused = {
-            "--report": page, "--covariance": covariance, "--contributions": contributions, "--gauge": gauge,
-            "--line-chart": line_chart, "--refine-intrinsics": refine_intrinsics, "--refine-rigs": refine_rigs,
-            "--camera-model": camera_model, "--rolling-shutter": rolling_shutter, **measured.given,
+        refused |= {
+            "--gauge": gauge, "--refine-intrinsics": refine_intrinsics, "--refine-rigs": refine_rigs,
+            "--no-points": not points, "--no-lines": not lines, "--no-planes": not planes, "--line-chart": line_chart,
+            "--line-residual": line_residual != "endpoints", "--plane-residual": plane_residual != "normal_offset",
         }  # fmt: skip
         graph_options = _chosen(
             loss="none" if loss == "auto" else loss, loss_scale=loss_scale, linear_solver=linear_solver,
@@ -226,10 +235,6 @@ def adjust(
         line_residual=line_residual, plane_residual=plane_residual, threads=console.threads,
     ))  # fmt: skip
     if in_parts:
-        refused = {
-            "--report": page, "--covariance": covariance, "--contributions": contributions, "--diagnosis": diagnosis,
-            "--camera-model": camera_model, "--rolling-shutter": rolling_shutter, **measured.given,
-        }  # fmt: skip
         adjust_parts_and_write(source, console, options, PartsWanted(output, console.json_target, force, keep), refused)
         return
     wanted = Wanted(

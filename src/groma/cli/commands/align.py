@@ -32,7 +32,6 @@ def align(
     control: _measured.Control = None,
     crs: _measured.Crs = None,
     force: _options.Force = False,
-    seed: _options.NoSeed = 0,
 ) -> None:
     """Align a scene with a reference by a robust similarity.
 

@@ -36,7 +36,7 @@ def demo(
     from groma.mapping.options import MapOptions
 
     console.say("58 photographs of a filing cabinet, nearly without texture (TUM RGB-D benchmark), about a minute.")
-    folder, work = cabinet.folder(), output.with_name(output.name + ".work")
+    folder, work = cabinet.folder(), _output.work_folder(output)
     images, reference = folder / "images", read_scene(folder / "motion_capture")
     # Blurred frames of a video show few lines, and some of them barely; all are kept to show what there is.
     options = MapOptions(threads=console.threads, min_confidence=0.0)

@@ -10,13 +10,14 @@ from groma._counted import counted
 from groma.cli.shared import options as _options
 from groma.cli.shared import output as _output
 from groma.cli.shared.console import Console
-from groma.cli.shared.input import check_inputs
+from groma.cli.shared.input import check_inputs, refuse_idle
 from groma.errors import InputError
 
 # As groma.io.trajectories and groma.evaluation.trajectory have them; not imported, because they load NumPy.
 _Format = Literal["auto", "tum", "kitti", "euroc"]
 _Alignment = Literal["se3", "sim3", "none"]
 _StepUnit = Literal["frames", "metres", "seconds"]
+_MAX_ANGLE = 10.0
 
 
 def poses(
@@ -97,6 +98,10 @@ def lines(
     check_inputs(estimate, reference, silhouettes)
     if reference is None and silhouettes is None:
         raise InputError("There is nothing to compare with. Pass a reference, --silhouettes FOLDER, or both.")
+    refuse_idle(
+        ("--align", align and reference is None, "with a reference"),
+        ("--threshold", bool(threshold) and reference is None, "with a reference"),
+    )
 
     numbers: dict[str, object] = {}
     if reference is not None:
@@ -162,7 +167,7 @@ def planes(
     threshold: _Thresholds = None,
     max_angle: Annotated[
         float, _options.PLAIN.option("Largest angle between planes that match.", metavar="DEG")
-    ] = 10.0,
+    ] = _MAX_ANGLE,
     max_offset: Annotated[
         float | None, _options.PLAIN.option("Largest offset of planes that match; by default 1 % of REF.", metavar="D")
     ] = None,
@@ -196,6 +201,10 @@ def planes(
             console.table(("", "mean", "largest"), rows)
         _output.write_json(console.json_target, found.to_dict(), force)
         return
+    refuse_idle(
+        ("--max-angle", max_angle != _MAX_ANGLE, "with planes to compare with"),
+        ("--max-offset", max_offset is not None, "with planes to compare with"),
+    )
     shares = score_planes_by_points(scene.planes.hesse, read_reference(reference).surface_points(), threshold)
     console.say(f"{counted(shares.num_planes, 'planes')}, {counted(shares.num_points, 'points')}")
     rows = [
@@ -229,7 +238,7 @@ def trajectory(
     Two files of equal length of which one has no times (KITTI) are matched by line.
     """
     _output.check_json(console.json_target, force)
-    check_inputs(estimate, reference)
+    check_inputs(estimate, reference, times)
 
     from groma.evaluation.trajectory import Spread, counts_lines, score_trajectory
     from groma.io import read_trajectory
@@ -240,6 +249,7 @@ def trajectory(
         return [f"{name}, {unit}", *(f"{value:.4g}" for value in values)]
 
     ours, theirs = read_trajectory(estimate, format), read_trajectory(reference, format)
+    refuse_idle(("--times", times is not None and not counts_lines(theirs), "on a REF without times of its own"))
     beside = reference.with_name("times.txt")
     if times is None and counts_lines(theirs) and not counts_lines(ours) and beside.is_file():
         times = beside if len(read_times(beside)) == len(theirs) else None

@@ -74,14 +74,18 @@ def localize(
 
     _output.check_outputs(force, output, json_target=console.json_target)
     check_inputs(map_, *queries, images)
-    refuse_idle(("--min-length", min_length != _MIN_LENGTH and not lines, "with lines"))
+    refuse_idle(
+        ("--min-length", min_length != _MIN_LENGTH and not lines, "with lines"),
+        ("--calibration", calibration != "auto" and camera_model is not None, "without --camera-model"),
+    )
 
     import shutil
 
     from groma.cli.shared.extending import DESCRIBING, LOCALIZING
-    from groma.cli.shared.interrupt import PROCESS, interruptible
+    from groma.cli.shared.interrupt import stages_that_are_kept
     from groma.cli.shared.mapping import WRITING
     from groma.execution import work_with
+    from groma.features.images import one_opencv_thread
     from groma.localization.calibration import CalibrationChoice
     from groma.localization.localizer import LocalizeOptions, Localizer
     from groma.localization.pose.absolute_pose import PoseOptions
@@ -91,17 +95,14 @@ def localize(
     choice = CalibrationChoice(calibration, camera_model, camera_parameters(camera_params))
     files = query_files(queries)
     options = LocalizeOptions(lines=lines, min_segment_length=min_length, pose=PoseOptions(seed=seed))
+    if console.threads is not None:  # each photograph has one of them
+        one_opencv_thread()
     console.expect_compilation("localize")
     console.expect_stages(*DESCRIBING, LOCALIZING, WRITING)
-    work = output.with_name(output.name + ".work")
-    try:
-        with interruptible() as interruption, console.stages() as stages, work_with(console.threads):
-            say = interruption.checking(stages)
-            localizer = Localizer(map_, images, options=options, progress=say)
-            found = localize_images(localizer, files, work, choice, say)
-    except KeyboardInterrupt:
-        words = f"finished queries are kept in {work}: the same command resumes there."
-        raise typer.Exit(PROCESS.tell(words)) from None
+    work = _output.work_folder(output)
+    with stages_that_are_kept(console, f"finished queries are kept in {work}") as say, work_with(console.threads):
+        localizer = Localizer(map_, images, options=options, progress=say)
+        found = localize_images(localizer, files, work, choice, say)
     if localizer.warning:
         console.warn(localizer.warning)
     result = LocalizeResult(localizer.scene, localizer.index, tuple(found))

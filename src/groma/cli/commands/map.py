@@ -192,7 +192,7 @@ def map_(
         min_segment_length=min_length,
         detector=line_detector,
         matcher=line_matcher,
-        lines=MapLinesOptions(cluster_size=cluster_size),
+        lines=MapLinesOptions(min_length=min_length, cluster_size=cluster_size),
         min_confidence=min_confidence,
         find_planes=planes,
         refine_points=refine_points,
@@ -209,14 +209,15 @@ def map_(
         threads=console.threads,
         seed=seed,
     )
+    refuse_idle(("--refine-rig", refine_rig and not (placed or options.rigs), "with --rig"))
     start, options = _start(console, images, model, poses, options)
     matches = read_matches(line_matches) if line_matches is not None else None
     true = read_scene(truth) if truth is not None else None
-    work = output.with_name(output.name + ".work")
+    work = _output.work_folder(output)
     photographs, extended = images, None
     if extend is not None:
         stages = stages_of_map(options, "model", bool(measured), matches is not None)
-        extended = extend_map(console, extend, images, map_images, output, force, stages)
+        extended = extend_map(console, extend, images, map_images, output, force, stages, seed)
         photographs, start = extended.folder, extended.scene
     survey = measured.read(photographs, lambda: _names_in(photographs)) if measured else None
     with work_with(console.threads):

@@ -48,8 +48,9 @@ def merge(
 
     options = MapOptions(threads=console.threads, seed=seed)
     stages = stages_of_map(options)
-    merged = merge_maps(console, (first, second), (first_images, second_images), scale, output, force, stages)
-    work = output.with_name(output.name + ".work")
+    work = _output.work_folder(output)
+    images = (first_images, second_images)
+    merged = merge_maps(console, (first, second), images, scale, output, force, stages, seed)
     result = run_map(console, merged.folder, work, merged.scene, options)
     result = in_world_of(result, merged.map)
     anew = result.scene.num_lines

@@ -105,15 +105,17 @@ def track(
     frames = open_sequence(
         sequence, camera=camera, depth_scale=depth_scale, stride=stride, max_frames=max_frames, kind=known
     )
-    if frames.camera.baseline is None:  # dense disparities of pairs pay for threads of their own
+    alone = console.threads == 1
+    if alone or frames.camera.baseline is None:  # dense disparities of pairs pay for threads of their own
         one_opencv_thread()
     source = FrameSource.of(sequence, camera, depth_scale=depth_scale, kind=known)
     options = TrackOptions(
-        points=points, lines=lines, planes=planes, close_loops=loops, max_depth=max_depth, detector=line_detector
-    )
+        points=points, lines=lines, planes=planes, close_loops=loops, max_depth=max_depth, detector=line_detector,
+        threaded=not alone,
+    )  # fmt: skip
     options.make_detector()  # refuses a wrong name now
     console.expect_compilation("track")
-    work = output.with_name(output.name + ".work")
+    work = _output.work_folder(output)
     console.expect_stages(*(() if map_ is None else ("reading the map",)), *_STAGES, WRITING)
     with console.stages() as stages:
 

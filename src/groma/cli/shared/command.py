@@ -49,6 +49,8 @@ Threads = Annotated[
     GENERAL.option("Use at most N threads. Default: one per core, where that pays.", "--threads", min=1, metavar="N"),
 ]
 NoColor = Annotated[bool, GENERAL.option("Use no colours; so does the environment variable NO_COLOR.", "--no-color")]
+#: Of commands that draw no random numbers: accepted, so that a script can pass it to every command, and not shown.
+NoSeed = Annotated[int, typer.Option("--seed", min=0, hidden=True)]
 
 
 class Command(TyperCommand):
@@ -135,7 +137,7 @@ def _heading(parameter: Any) -> str:
 
 def console_of(
     threads: Threads = None, json_target: Json = None, quiet: Quiet = False, verbose: Verbose = False,
-    no_color: NoColor = False,
+    no_color: NoColor = False, seed: NoSeed = 0,
 ) -> Console:  # fmt: skip
     """Return the console that obeys the options that every command takes."""
     forbid_colours(no_color)
@@ -148,7 +150,8 @@ def with_common_options(command: Callable[..., None]) -> Callable[..., None]:
     A parameter that is a dataclass stands for the options that its fields declare. An option that the command has
     itself, too, is given to both.
     """
-    own, common = inspect.signature(command, eval_str=True), inspect.signature(console_of, eval_str=True).parameters
+    own, every = inspect.signature(command, eval_str=True), inspect.signature(console_of, eval_str=True).parameters
+    common = {name: one for name, one in every.items() if name not in own.parameters}
     groups: dict[str, Any] = {
         name: one.annotation for name, one in own.parameters.items() if is_dataclass(one.annotation)
     }

@@ -8,15 +8,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-import typer
-
-from groma.cli.shared.interrupt import PROCESS
+from groma.cli.shared.interrupt import stages_that_are_kept
+from groma.cli.shared.output import work_folder
 from groma.errors import InputError, OutputError
 
 if TYPE_CHECKING:
     from groma.cli.shared.console import Console
     from groma.localization.extension import ExtendedModel
     from groma.localization.joining.merging import MergedModel
+    from groma.localization.localizer import Localizer
 
 _Made = TypeVar("_Made")
 Names = tuple[str, ...]
@@ -30,23 +30,31 @@ _WITH_POINTS: Names = ("finding points in images", "placing points")
 
 
 def extend_map(
-    console: Console, map_: Path, new: Path, map_images: Path | None, output: Path, force: bool, following: Names
+    console: Console,
+    map_: Path,
+    new: Path,
+    map_images: Path | None,
+    output: Path,
+    force: bool,
+    following: Names,
+    seed: int,
 ) -> ExtendedModel:
     """Localise photographs in a map; return the model of all of them. ``following`` are the stages after that."""
     from groma.localization.calibration import CalibrationChoice
     from groma.localization.extension import extended_model
-    from groma.localization.localizer import Localizer
     from groma.localization.run import query_files
 
     files = query_files([new])
-    folder, work = photograph_folder(output, force), output.with_name(f"{output.name}.queries")
+    folder, work = photograph_folder(output, force), work_folder(output, ".queries")
+    warnings: list[str] = []
 
     def made(say: Callable[[str, int, int], None]) -> ExtendedModel:
-        return extended_model(Localizer(map_, map_images, progress=say), files, work, folder, CalibrationChoice(), say)
+        map_of_photographs = _localizer(map_, map_images, seed, say, warnings)
+        return extended_model(map_of_photographs, files, work, folder, CalibrationChoice(), say)
 
     console.expect_stages(*DESCRIBING, LOCALIZING, *_WITH_POINTS, *following)
     extended = _with_progress(console, made, f"finished photographs are kept in {work}")
-    for sentence in extended.warnings():
+    for sentence in (*warnings, *extended.warnings()):
         console.warn(sentence)
     return extended
 
@@ -59,21 +67,25 @@ def merge_maps(
     output: Path,
     force: bool,
     following: Names,
+    seed: int,
 ) -> MergedModel:
     """Find how two maps lie to each other; return the model of both. ``following`` are the stages after that."""
     from groma.localization.joining.merging import merged_model
-    from groma.localization.localizer import Localizer, photographs_of
+    from groma.localization.localizer import photographs_of
 
     for one, where in zip(maps, images, strict=True):
         photographs_of(one, where)  # before minutes are spent on the other
     folder = photograph_folder(output, force)
+    warnings: list[str] = []
 
     def made(say: Callable[[str, int, int], None]) -> MergedModel:
-        first, second = (Localizer(one, where, progress=say) for one, where in zip(maps, images, strict=True))
+        first, second = (_localizer(one, where, seed, say, warnings) for one, where in zip(maps, images, strict=True))
         return merged_model(first, second, folder, "similarity" if scale else "rigid", say)
 
     console.expect_stages(*DESCRIBING, *DESCRIBING, COMPARING, *_WITH_POINTS, *following)
     merged = _with_progress(console, made, "the descriptions of the maps are kept beside them")
+    for sentence in warnings:
+        console.warn(sentence)
     console.say(merged.sentence())
     return merged
 
@@ -102,13 +114,24 @@ def check_extension(extend: Path | None, map_images: Path | None, others: dict[s
         raise InputError(f"--extend and {given[0]} exclude each other. Leave one of them out.")
 
 
-def _with_progress(console: Console, made: Callable[[Callable[[str, int, int], None]], _Made], kept: str) -> _Made:
-    from groma.cli.shared.interrupt import interruptible
-    from groma.execution import work_with
+def _localizer(
+    map_: Path, images: Path | None, seed: int, say: Callable[[str, int, int], None], warnings: list[str]
+) -> Localizer:
+    """Return what localises in a map; what could not be done as wanted is added to the warnings."""
+    from groma.localization.localizer import LocalizeOptions, Localizer
+    from groma.localization.pose.absolute_pose import PoseOptions
 
+    localizer = Localizer(map_, images, options=LocalizeOptions(pose=PoseOptions(seed=seed)), progress=say)
+    warnings += [localizer.warning] if localizer.warning else []
+    return localizer
+
+
+def _with_progress(console: Console, made: Callable[[Callable[[str, int, int], None]], _Made], kept: str) -> _Made:
+    from groma.execution import work_with
+    from groma.features.images import one_opencv_thread
+
+    if console.threads is not None:  # each photograph has one of them
+        one_opencv_thread()
     console.expect_compilation("map")
-    try:
-        with interruptible() as interruption, console.stages() as stages, work_with(console.threads):
-            return made(interruption.checking(stages))
-    except KeyboardInterrupt:
-        raise typer.Exit(PROCESS.tell(f"{kept}: the same command resumes there.")) from None
+    with stages_that_are_kept(console, kept) as say, work_with(console.threads):
+        return made(say)

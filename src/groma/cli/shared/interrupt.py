@@ -12,6 +12,10 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from groma.cli.shared.console import Console
 
 #: Exit code of a command that was interrupted.
 INTERRUPTED = 130
@@ -95,3 +99,15 @@ def interruptible() -> Iterator[Interruption]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def stages_that_are_kept(console: "Console", words: str) -> Iterator[Callable[[str, int, int], None]]:
+    """Yield the progress of stages; Ctrl-C ends the command, and says with some words what is kept of them."""
+    import typer
+
+    try:
+        with interruptible() as interruption, console.stages() as stages:
+            yield interruption.checking(stages)
+    except KeyboardInterrupt:
+        raise typer.Exit(PROCESS.tell(f"{words}: the same command resumes there.")) from None

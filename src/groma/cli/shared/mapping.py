@@ -6,12 +6,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
-
 from groma.cli.shared import output as _output
 from groma.cli.shared.depth import say_depth
 from groma.cli.shared.diagnosis import DIAGNOSING
-from groma.cli.shared.interrupt import PROCESS
+from groma.cli.shared.interrupt import stages_that_are_kept
 from groma.cli.shared.measurements import say_survey
 from groma.errors import OutputError
 
@@ -40,7 +38,6 @@ def run_map(
     depth: DepthMaps | None = None,
 ) -> MapResult:
     """Map a folder of photographs; Ctrl-C ends the command and keeps the finished stages in ``work``."""
-    from groma.cli.shared.interrupt import interruptible
     from groma.compilation.loading import loading
     from groma.execution import share_memory
     from groma.features.images import one_opencv_thread
@@ -56,13 +53,9 @@ def run_map(
         *stages_of_map(options, start, survey is not None, line_matches is not None, depth is not None)
     )
     if has_stages(work):
-        console.say(f"Resuming from the finished stages in {work}.")
-    try:
-        with interruptible() as interruption, console.stages() as stages, loading("map", options.threads):
-            return map_images(images, work, model, options, interruption.checking(stages), line_matches, survey, depth)
-    except KeyboardInterrupt:
-        words = f"finished stages are kept in {work}: the same command resumes there."
-        raise typer.Exit(PROCESS.tell(words)) from None
+        console.say(f"Resuming from the finished stages in {work}, as far as they fit.")
+    with stages_that_are_kept(console, f"finished stages are kept in {work}") as say, loading("map", options.threads):
+        return map_images(images, work, model, options, say, line_matches, survey, depth)
 
 
 def stages_of_map(

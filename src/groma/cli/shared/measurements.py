@@ -132,6 +132,7 @@ class Measured:
         needs = {
             "--position-sigma": (self.position_sigma, self.positions, "--positions"),
             "--control-sigma": (self.control_sigma, self.control, "--control"),
+            "--mark-sigma": (None if self.mark_sigma == 1.0 else self.mark_sigma, self.control, "--control"),
             "--check": (self.check, self.control, "--control"),
             "--distance-sigma": (self.distance_sigma, self.distances, "--distances"),
             "--direction-sigma": (self.direction_sigma, self.directions, "--directions"),

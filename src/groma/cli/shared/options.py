@@ -14,8 +14,6 @@ CAMERAS, LANDMARKS = Panel("Cameras and poses"), Panel("Points, lines and planes
 ADJUSTMENT, RESULTS = Panel("Adjustment"), Panel("Results")
 
 Seed = Annotated[int, GENERAL.option("Seed of the random numbers.", min=0, metavar="N")]
-#: Of commands that draw no random numbers: accepted, so that a script can pass it to every command, and not shown.
-NoSeed = Annotated[int, typer.Option("--seed", min=0, hidden=True)]
 Force = Annotated[bool, PLAIN.option("Replace what is there.", "--force", "-f")]
 #: Of commands that write nothing but a report for machines.
 ForceReport = Annotated[bool, GENERAL.option("Replace the file of --json.", "--force", "-f")]

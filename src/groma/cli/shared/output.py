@@ -16,6 +16,9 @@ _RESULTS = re.compile(
     r"summary\.json|adjustment\.txt|report\.html|trajectory\.txt|poses\.txt|localized\.json|(submap|part)_\d+"
 )
 
+#: What a running track keeps (:mod:`groma.tracking.journal`).
+_JOURNAL = {"frames.txt", "keyframes.txt", "statuses.txt", "trajectory.txt", "scene.npz", "now.npz", "now.draft"}
+
 
 def check_outputs(
     force: bool, output: Path | None, *files: Path | None, json_target: str | None = None, file: bool = False
@@ -71,6 +74,8 @@ def check_output(path: Path, force: bool, file: bool = False) -> None:
         ) from error
     if not (path.exists() or path.is_symlink()):
         return
+    if path.is_dir() and not file and path.resolve() in (here := Path.cwd(), *here.parents):
+        raise OutputError(f"{path} is the folder that you are in, or above it, and would be replaced. Name a new one.")
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise OutputError(f"{path} is a device or a pipe, not a file. Pass a file name; --json - is standard output.")
     if file and path.is_dir():
@@ -84,6 +89,25 @@ def check_output(path: Path, force: bool, file: bool = False) -> None:
                 f"{path} holds {foreign[0]!r}, which groma did not write; --force does not replace such a folder. "
                 "Choose another name."
             )
+
+
+def work_folder(output: Path, ending: str = ".work") -> Path:
+    """Return the folder beside a result in which finished work is kept, which is removed at the end.
+
+    Raises
+    ------
+    OutputError
+        If it holds anything and is none that groma made.
+    """
+    folder = output.with_name(output.name + ending)
+    names = {entry.name for entry in folder.iterdir()} if folder.is_dir() else set()
+    is_ours = next(folder.glob("**/lock"), None) is not None or names <= _JOURNAL
+    if not is_ours or (folder.exists() and not folder.is_dir()):
+        raise OutputError(
+            f"{folder} is where finished work is kept until the end, and is none that groma made. Move it away, or "
+            "choose another output."
+        )
+    return folder
 
 
 @contextmanager

@@ -7,7 +7,6 @@ pairs together give the motion between the worlds (:mod:`groma.estimators.motion
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +23,7 @@ from groma.gates import gate
 from groma.geometry.so3 import hat
 from groma.localization.joining.kept_lines import segments_apart, with_lines_of
 from groma.localization.localizer import LocalizedImage, Localizer
+from groma.localization.map_images import content_digest
 from groma.localization.map_index import Progress
 from groma.localization.placed import PlacedImage
 from groma.localization.pose.camera import QueryCamera
@@ -115,8 +115,8 @@ def merged_model(first: Localizer, second: Localizer, folder: Path, kind: Kind, 
     motion = _motion(matches, kind)
     moved = second.scene.transformed(Similarity.from_array(motion.similarity))
     poses = {image: _pose_of(moved, image, one) for image, one in found.items()}
-    known = {_digest(path): row for row, path in enumerate(first.files)}
-    digests = [_digest(path) for path in second.files]
+    known = {content_digest(path): row for row, path in enumerate(first.files)}
+    digests = [content_digest(path) for path in second.files]
     fresh = [row for row, digest in enumerate(digests) if digest not in known]
     placed = [_as_placed(moved, row, poses.get(row)) for row in fresh]
     paths = [*first.files, *(second.files[row] for row in fresh)]
@@ -284,7 +284,3 @@ def _as_placed(scene: Scene, image: int, pose: FloatArray | None) -> PlacedImage
         scene.images.names[image], "localized", "", own, np.zeros((6, 6)), camera.model,
         camera.params, np.array([camera.width, camera.height]), none, np.zeros((0, 2)), none, np.zeros((0, 4)), 0.0,
     )  # fmt: skip
-
-
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -225,7 +225,7 @@ def _padded(covariance: FloatArray, scene: Scene, count: int) -> FloatArray:
     return out
 
 
-def _responses(scene: Scene, kind: str, parameters: int, gates: CommonErrorGates = GATES) -> Responses:
+def _responses(scene: Scene, kind: str, parameters: int) -> Responses:
     """How the landmarks of one kind follow errors of poses, and of so many parameters of each camera."""
     size, total = (3 if kind == "points" else 6), len(getattr(scene, kind))
     options = AssemblyOptions(refine_intrinsics=True, drop_behind=False, point_chart="euclidean", gauge="free")
@@ -244,7 +244,7 @@ def _responses(scene: Scene, kind: str, parameters: int, gates: CommonErrorGates
         count = 0 if lens is None else problem.variables[lens.group].state.shape[1]
         wanted = {"pose": 6, **({"intrinsics": count} if count else {}), kind[:-1]: size}
         white = times(factor.sqrt_information, records(problem, factor, wanted))
-        weight = (1.0 + (white[..., -1] ** 2).sum(axis=1) / gates.loss**2) ** -2
+        weight = (1.0 + (white[..., -1] ** 2).sum(axis=1) / GATES.loss**2) ** -2
         J = white[..., 6 + count : -1] @ free[landmark]
         np.add.at(V, landmark, np.einsum("n,nki,nkj->nij", weight, J, J))
         by_view = np.zeros((len(factor), free.shape[2], 6 + parameters))

@@ -21,7 +21,7 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.localization.pose.camera import QueryCamera
-from groma.localization.pose.gates import REFINEMENT, RefinementGates
+from groma.localization.pose.gates import REFINEMENT
 
 #: What is estimated: nothing; the focal length (several by one factor); that and the principal point; or these, with a
 #: priors, the first distortion, and the shape of pixels.
@@ -83,14 +83,14 @@ class FreeLens:
         return record.T @ record
 
 
-def free_lens(camera: QueryCamera, lens: LensUnknowns, gates: RefinementGates = REFINEMENT) -> FreeLens | None:
+def free_lens(camera: QueryCamera, lens: LensUnknowns) -> FreeLens | None:
     """Return what is estimated of a camera, whose principal point is where it is expected; None for nothing."""
     if lens == "none":
         return None
     kind, unknown = camera.kind, lens == "all"
     center = np.array(kind.principal_point_indices if lens != "focal" else (), np.int64)
     distortion = np.array(kind.extra_indices[:1] if unknown else (), np.int64)
-    sigma = gates.centred * max(camera.width, camera.height) if unknown else np.inf
+    sigma = REFINEMENT.centred * max(camera.width, camera.height) if unknown else np.inf
     shape = unknown and len(kind.focal_indices) == 2
     focal = np.array(kind.focal_indices)
-    return FreeLens(focal, center, distortion, shape, camera.params[center], sigma, 0.5 * gates.square)
+    return FreeLens(focal, center, distortion, shape, camera.params[center], sigma, 0.5 * REFINEMENT.square)

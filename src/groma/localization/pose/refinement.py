@@ -40,7 +40,7 @@ from groma.gates import chi_square_gate
 from groma.geometry import se3
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.free_lens import FreeLens
-from groma.localization.pose.gates import REFINEMENT, RefinementGates
+from groma.localization.pose.gates import REFINEMENT
 from groma.localization.pose.matches import Matches, nearest_claims
 from groma.localization.pose.one_pose import OnePose, Part
 from groma.localization.pose.pose_fit import FINELY, ROUGHLY, fit_pose
@@ -101,34 +101,34 @@ class Refined:
         """(6 + k, 6 + k) what is known of the lens before: information."""
         return np.zeros((6, 6)) if self.lens is None else self.lens.prior(self.camera.params)[:-1, :-1]
 
-    def covariance(self, matches: Matches, gates: RefinementGates = REFINEMENT) -> FloatArray:
+    def covariance(self, matches: Matches) -> FloatArray:
         """(6, 6) covariance of the left twist; infinite where the matches do not determine the pose."""
-        return self.joint_covariance(matches, gates)[:6, :6]
+        return self.joint_covariance(matches)[:6, :6]
 
-    def joint_covariance(self, matches: Matches, gates: RefinementGates = REFINEMENT) -> FloatArray:
+    def joint_covariance(self, matches: Matches) -> FloatArray:
         """(6 + k, 6 + k) covariance of the left twist and of what is estimated of the lens."""
-        noise = self.noise_covariance(matches, gates)
+        noise = self.noise_covariance(matches)
         if matches.shared_error == 0.0 or not np.isfinite(noise).all():
             return noise
-        return noise + matches.shared_error**2 * self.shared_covariance(matches, gates)
+        return noise + matches.shared_error**2 * self.shared_covariance(matches)
 
-    def shared_covariance(self, matches: Matches, gates: RefinementGates = REFINEMENT) -> FloatArray:
+    def shared_covariance(self, matches: Matches) -> FloatArray:
         """Covariance of the same if what each cell shows is off by one radian, together."""
         chosen = ((self.points, self.point_inliers), (self.lines, self.line_inliers))
         J = np.concatenate([found.by_pose[kept] * np.sqrt(found.spread[kept, None, None]) for found, kept in chosen])
-        cell = self._cells(matches, gates)
+        cell = self._cells(matches)
         J /= float(self.camera.kind.focal_length(self.camera.params))
         information = np.einsum("n,nki,nkj->ij", 1.0 / np.bincount(cell)[cell], J, J)
         information += self.prior * matches.shared_error**2
         scale = 1.0 / np.sqrt(np.diag(information))
         return np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
 
-    def _cells(self, matches: Matches, gates: RefinementGates) -> IntArray:
+    def _cells(self, matches: Matches) -> IntArray:
         """Number the matches that agree by the cells of the image that they lie in."""
         middle = matches.segments2d.mean(axis=1)[self.line_inliers]
-        return cells_of(np.concatenate([matches.points2d[self.point_inliers], middle]), self.camera, gates.cells)
+        return cells_of(np.concatenate([matches.points2d[self.point_inliers], middle]), self.camera, REFINEMENT.cells)
 
-    def noise_covariance(self, matches: Matches, gates: RefinementGates = REFINEMENT) -> FloatArray:
+    def noise_covariance(self, matches: Matches) -> FloatArray:
         """Covariance of the same by the noise of image and landmarks alone."""
         chosen = ((self.points, self.point_inliers), (self.lines, self.line_inliers))
         J = np.concatenate([found.by_pose[kept] for found, kept in chosen])
@@ -136,13 +136,13 @@ class Refined:
         scale = np.sqrt((J**2).sum(axis=(0, 1)))
         if not (scale > 0.0).all():
             return np.full((J.shape[2], J.shape[2]), np.inf)
-        pull, sigma = _pull(r, J.shape[2], gates)
+        pull, sigma = _pull(r, J.shape[2])
         white = (J / scale).reshape(-1, len(scale))
         values, vectors = np.linalg.eigh(white.T @ white + sigma**2 * self.prior / np.outer(scale, scale))
         if not values[0] > _SINGULAR:
             return np.full((J.shape[2], J.shape[2]), np.inf)
         root = sigma * vectors / np.sqrt(values) / scale[:, None]
-        cell = self._cells(matches, gates)
+        cell = self._cells(matches)
         count, dof = int(cell.max()) + 1, len(scale)
         gradient = np.zeros((count, dof))
         pulled = np.einsum("nki,nk->ni", J @ (root / sigma), pull / sigma)
@@ -155,7 +155,7 @@ class Refined:
         return root @ root.T
 
 
-def _pull(residual: FloatArray, unknowns: int, gates: RefinementGates) -> tuple[FloatArray, float]:
+def _pull(residual: FloatArray, unknowns: int) -> tuple[FloatArray, float]:
     r"""Return what each residual (n, 2) pulls under the last loss, and the standard deviation of an observation for an
     estimate by it.
 
@@ -164,7 +164,7 @@ def _pull(residual: FloatArray, unknowns: int, gates: RefinementGates) -> tuple[
     variance that residuals show comes, counted as some more observations, that of normal noise as stated. It is not
     the ratio of averages: with few matches that would be too small.
     """
-    scale = last_scale(len(residual), gates)
+    scale = last_scale(len(residual))
     c, free = scale**2, max(residual.size - unknowns, 0)
     weight = (1.0 + (residual**2).sum(axis=1, keepdims=True) / c) ** -2
     # A fit makes residuals smaller than the noise; of a few matches so much that a loss would seem stiffer than it is.
@@ -175,7 +175,7 @@ def _pull(residual: FloatArray, unknowns: int, gates: RefinementGates) -> tuple[
     mean = max(float(stiffness.mean()), float(of_noise.mean()) ** 2)  # of far outliers the former may vanish
     shown = float(((of_noise * noise) ** 2).mean()) / mean**2
     square_of_normal, stiffness_of_normal = _of_normal_noise(scale)
-    stated = 2.0 * gates.stated_weight
+    stated = 2.0 * REFINEMENT.stated_weight
     variance = (free * shown + stated * square_of_normal / stiffness_of_normal**2) / (free + stated)
     mean = (free * mean + stated * stiffness_of_normal) / (free + stated)
     return weight * residual / mean, float(np.sqrt(variance))
@@ -207,7 +207,6 @@ def refine(
     max_error: tuple[float, float],
     lens: FreeLens | None = None,
     gathered: bool = False,
-    gates: RefinementGates = REFINEMENT,
 ) -> Refined:
     """Fit a pose to what is near it, again to what is near then, until that stays the same; last with a narrow loss.
 
@@ -223,8 +222,6 @@ def refine(
         What is estimated of the camera, too.
     gathered
         The matches were looked for near the start, as far as it may be off: all of them are near at first.
-    gates
-        Numbers of the fit.
     """
     one = problem_of(camera, matches, start, lens is not None)
     limits = [
@@ -232,13 +229,13 @@ def refine(
         for error, sigma in zip(max_error, (matches.point_sigma, matches.segment_sigma), strict=True)
     ]
     near: tuple[BoolArray, BoolArray] | None = None
-    for round_ in range(gates.rounds + 1):
+    for round_ in range(REFINEMENT.rounds + 1):
         weights = landmark_weights(one, matches)
         squares = residual_squares_of(one, weights, matches)
         wide = gathered and round_ == 0
         before, near = near, (wide | (squares[0] <= limits[0]), wide | (squares[1] <= limits[1]))
-        last = round_ == gates.rounds or (before is not None and all(map(np.array_equal, near, before)))
-        loss = GemanMcClure(last_scale(_agreeing(squares, gates), gates)) if last else Cauchy(gates.wide_loss)
+        last = round_ == REFINEMENT.rounds or (before is not None and all(map(np.array_equal, near, before)))
+        loss = GemanMcClure(last_scale(_agreeing(squares))) if last else Cauchy(REFINEMENT.wide_loss)
         moved = fit_pose(one, weights, near, loss, FINELY if last else ROUGHLY, lens)
         estimated = camera if lens is None else _camera_of(moved, camera)
         if estimated is None:
@@ -246,19 +243,19 @@ def refine(
         camera, one = estimated, moved
         if last:
             break
-    return _fitted(one, camera, matches, max_error, lens, gates)
+    return _fitted(one, camera, matches, max_error, lens)
 
 
-def _agreeing(squares: tuple[FloatArray, FloatArray], gates: RefinementGates) -> int:
-    return int((np.concatenate(squares) <= chi_square_gate(gates.outlier, 2)).sum())
+def _agreeing(squares: tuple[FloatArray, FloatArray]) -> int:
+    return int((np.concatenate(squares) <= chi_square_gate(REFINEMENT.outlier, 2)).sum())
 
 
-def last_scale(agree: int, gates: RefinementGates = REFINEMENT) -> float:
+def last_scale(agree: int) -> float:
     """Return the scale of the last loss for so many matches that agree, standard deviations.
 
     Where there are hardly more than the pose needs, a narrow loss picks those that happen to fit each other.
     """
-    return gates.last_loss * (1.0 + gates.stated_weight / max(2 * agree - 6, 1))
+    return REFINEMENT.last_loss * (1.0 + REFINEMENT.stated_weight / max(2 * agree - 6, 1))
 
 
 def fitted(
@@ -267,10 +264,9 @@ def fitted(
     pose: FloatArray,
     max_error: tuple[float, float],
     lens: FreeLens | None = None,
-    gates: RefinementGates = REFINEMENT,
 ) -> Refined:
     """Say which matches agree with a pose as it is; parameters as of :func:`refine`."""
-    return _fitted(problem_of(camera, matches, pose, lens is not None), camera, matches, max_error, lens, gates)
+    return _fitted(problem_of(camera, matches, pose, lens is not None), camera, matches, max_error, lens)
 
 
 def _fitted(
@@ -279,14 +275,13 @@ def _fitted(
     matches: Matches,
     max_error: tuple[float, float],
     lens: FreeLens | None,
-    gates: RefinementGates,
 ) -> Refined:
     weights = landmark_weights(one, matches)
     directions = None if lens is None else lens.directions(one.params)
     points = residuals(one, weights, "points", matches.num_points, directions)
     lines = residuals(one, weights, "lines", matches.num_lines, directions)
-    sigma0 = _noise((points, lines), matches, max_error, gates)
-    limit = chi_square_gate(gates.outlier, 2) * sigma0**2
+    sigma0 = _noise((points, lines), matches, max_error)
+    limit = chi_square_gate(REFINEMENT.outlier, 2) * sigma0**2
     near = (points.square <= limit, (lines.square <= limit) & _in_front(camera, matches, one.pose))
     agree = [
         nearest_claims(claim, found.square, inside)
@@ -330,9 +325,7 @@ def _widened(one: OnePose, part: Part, covariance: FloatArray) -> FloatArray:
     return sqrt_information
 
 
-def _noise(
-    found: tuple[Residuals, Residuals], matches: Matches, max_error: tuple[float, float], gates: RefinementGates
-) -> float:
+def _noise(found: tuple[Residuals, Residuals], matches: Matches, max_error: tuple[float, float]) -> float:
     """Noise that the residuals show beside what was stated, from those that are no outliers for sure.
 
     The median of what lies below a limit is too small where noise reaches the limit; the limit is wide.
@@ -347,7 +340,9 @@ def _noise(
         return 1.0
     free = max(1.0 - 3.0 / len(together), 0.1)  # six of two times so many numbers went into the pose
     shown = float(np.median(together)) / (chi_square_gate(0.5, 2) * free)
-    return float(np.sqrt((gates.stated_weight + len(together) * shown) / (gates.stated_weight + len(together))))
+    return float(
+        np.sqrt((REFINEMENT.stated_weight + len(together) * shown) / (REFINEMENT.stated_weight + len(together)))
+    )
 
 
 def _camera_of(one: OnePose, camera: QueryCamera) -> QueryCamera | None:

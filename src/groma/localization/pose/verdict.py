@@ -36,7 +36,7 @@ from groma._counted import counted
 from groma._typing import BoolArray, FloatArray
 from groma.geometry import se3
 from groma.localization.pose.camera import QueryCamera
-from groma.localization.pose.gates import VERDICT, VerdictGates
+from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.lens import LensStep
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.refinement import Refined, cells_of
@@ -138,7 +138,7 @@ def judge(
     return Verdict("localized", probability, f"{agree} agree.")
 
 
-def doubted_if_mirrored(verdict: Verdict, own: int, mirror: int, gates: VerdictGates = VERDICT) -> Verdict:
+def doubted_if_mirrored(verdict: Verdict, own: int, mirror: int) -> Verdict:
     """Return a verdict, or ``uncertain`` where of the most alike matches more are with the mirror image of a photograph
     (mirror) than with the photograph (own).
     """
@@ -148,7 +148,7 @@ def doubted_if_mirrored(verdict: Verdict, own: int, mirror: int, gates: VerdictG
         f"{verdict.sentence} But its mirror image fits about as well, and {mirror} of its matches are as alike as "
         f"{own} of the photograph: it may be mirrored."
     )
-    return Verdict("uncertain", 1.0 - gates.right, words)
+    return Verdict("uncertain", 1.0 - VERDICT.right, words)
 
 
 def doubted_if_in_pieces(verdict: Verdict, agree: int, elsewhere: int) -> Verdict:
@@ -162,14 +162,14 @@ def doubted_if_in_pieces(verdict: Verdict, agree: int, elsewhere: int) -> Verdic
     return Verdict("uncertain", 1.0 - VERDICT.right, words)
 
 
-def doubted_if_missing(verdict: Verdict, shown: float, missing: float, gates: VerdictGates = VERDICT) -> Verdict:
+def doubted_if_missing(verdict: Verdict, shown: float, missing: float) -> Verdict:
     """Return a verdict, or ``uncertain`` where about as much of what should be seen is missing as is there.
 
     ``shown`` and ``missing`` are numbers of parts of the image, by what is expected in them.
     """
     from scipy.special import betainc
 
-    chance = 1.0 - gates.whole
+    chance = 1.0 - VERDICT.whole
     few = shown > missing and 0.5 ** (shown + missing - 1.0) > chance  # so few that no test could say so much
     if missing < 1.0 or few or (shown > 0.0 and 2.0 * betainc(shown, missing + 1.0, 0.5) <= chance):
         return verdict
@@ -177,7 +177,7 @@ def doubted_if_missing(verdict: Verdict, shown: float, missing: float, gates: Ve
         f"{verdict.sentence} But in {missing:.0f} of {shown + missing:.0f} parts of the image where this place has "
         "points or lines none is seen: the photograph may show this place in a part only, or something like it."
     )
-    return Verdict("uncertain", 1.0 - gates.right, words)
+    return Verdict("uncertain", 1.0 - VERDICT.right, words)
 
 
 def doubted_if_repeated(verdict: Verdict, often: float) -> Verdict:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from groma._counted import natural_key
 from groma._typing import FloatArray, IntArray
 from groma.execution import begin
 from groma.scene import Scene
@@ -54,9 +55,10 @@ def _photograph(file: Path, budget: int) -> str:
 
 
 def _used(scene: Scene) -> IntArray:
-    """Return the images that observe something."""
+    """Return the images that observe something, in the order of their names: a model may have any."""
     seen = scene.point_observations.image_idx, scene.line_observations.image_idx
-    return np.flatnonzero(sum(np.bincount(one, minlength=scene.num_images) for one in seen))
+    used = np.flatnonzero(sum(np.bincount(one, minlength=scene.num_images) for one in seen))
+    return np.array(sorted(used.tolist(), key=lambda image: natural_key(scene.images.names[image])), np.int64)
 
 
 def image_data(scene: Scene, kept: Kept, states: Sequence[Drawable], photographs: Photographs) -> dict[str, Any]:
