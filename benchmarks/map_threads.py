@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """How much of ``groma map`` goes on in one thread, by stage, and how much faster two threads are.
 
-    python benchmarks/map_threads.py IMAGES --model MODEL --rounds 2
+    python benchmarks/map_threads.py IMAGES --model MODEL --rounds 3
 
 Runs with one thread and with two alternate, each in a process of its own; the first, which compiles, is not counted.
-Medians over the rounds. While a run with two threads goes on, this process looks 200 times a second how many of its
-threads can run. What is done while only one can is its *serial* work. A thread that could run but has to wait for a
-core counts as running: the serial share holds on a busy machine too, where the ratio of wall times does not. It reads
-the state of threads under ``/proc``, so it needs Linux.
+Medians over the rounds. Nothing looks at a run while it goes on: at the beginning of each stage it asks the system for
+the processor time of the process and for how long each of its threads had to wait for a core. Of a stage of W seconds
+in which threads ran or waited for R seconds in all, at most two at a time, only one could run for 2 W - R: its *serial*
+time. Multiplied by the share of R that was not waiting it is processor time, which holds on a busy machine too, where
+the ratio of wall times does not. Where three threads can run at once, R counts the third, and serial time is too low by
+it. Waiting is read under ``/proc``, which needs Linux; elsewhere it is taken as none.
 
 Columns: seconds of processor time and of wall time with one thread and the largest memory until then, the same with
 two, serial work in seconds of the processor time with two, and its share of all work.
@@ -22,21 +24,21 @@ import subprocess
 import sys
 import tempfile
 import time
-from bisect import bisect_right
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
-INTERVAL = 0.005
-
 
 def run(images, model, threads):
-    """Map, diagnose and write as the command does; return when each stage began, with the processor time until then."""
-    marks = []
+    """Map, diagnose and write as the command does; return what was used until the beginning of each stage."""
+    marks, waiting = [], {}
     gc.set_threshold(10_000)  # as the command does
 
     def mark(stage, *_):
-        if not marks or marks[-1][2] != stage:
-            marks.append((time.monotonic(), time.process_time(), stage, peak()))
+        if not marks or marks[-1]["stage"] != stage:
+            waiting.update(waited())
+            used = {"wall": time.monotonic(), "cpu": time.process_time(), "waited": sum(waiting.values())}
+            marks.append({"stage": stage, "peak": peak(), **used})
 
     mark("imports")
     from groma.cli.app import app  # noqa: F401 - the command line is part of every run
@@ -69,53 +71,36 @@ def peak():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def watched(command, bytecode):
-    """Run a command; return what it printed, and how many of its threads could run: times and numbers.
+def waited(tasks=Path("/proc/self/task")):
+    """Return for how many seconds each thread of this process that lives has waited for a core."""
+    found = {}
+    for task in tasks.iterdir() if tasks.is_dir() else ():
+        with suppress(OSError):  # it has ended
+            found[task.name] = 1e-9 * int((task / "schedstat").read_text().split()[1])
+    return found
 
-    Bytecode, which an installation brings along, is kept in a folder.
-    """
-    times, numbers = [], []
+
+def alone(command, bytecode):
+    """Run a command; return what it printed. Bytecode, which an installation brings along, is kept in a folder."""
     limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     kept = {"PYTHONPYCACHEPREFIX": bytecode, "PYTHONDONTWRITEBYTECODE": ""}
-    with tempfile.TemporaryFile("w+") as said:
-        process = subprocess.Popen(command, stdout=said, env=os.environ | limits | kept)
-        tasks = Path(f"/proc/{process.pid}/task")
-        while process.poll() is None:
-            times.append(time.monotonic())
-            numbers.append(sum(can_run(task) for task in os.listdir(tasks)) if tasks.is_dir() else 0)
-            time.sleep(INTERVAL)
-        if process.returncode:
-            sys.exit(process.returncode)
-        said.seek(0)
-        return json.loads(said.read().splitlines()[-1]), times, numbers
+    said = subprocess.run(command, stdout=subprocess.PIPE, env=os.environ | limits | kept, check=True).stdout
+    return json.loads(said.splitlines()[-1])
 
 
-def can_run(task, root=Path("/proc")):
-    """Whether a thread, by its number, runs or waits for a core."""
-    try:
-        return (root / task / "stat").read_text().rpartition(")")[2].split()[0] in ("R", "D")
-    except OSError:  # it has ended
-        return False
-
-
-def stages_of(found, times, numbers):
-    """Processor time, wall time and serial share of each stage of a run."""
-    marks, stages = found["marks"], {}
-    begins = [mark[0] for mark in marks]
-    for (begin, cpu, stage, _), (end, until, _, peak) in pairwise(marks):
-        entry = stages.setdefault(stage, {"cpu": 0.0, "wall": 0.0, "one": 0, "many": 0})
-        entry["peak"] = peak
-        entry["cpu"] += until - cpu
-        entry["wall"] += end - begin
-    stages[marks[0][2]]["cpu"] += marks[0][1]
-    for moment, number in zip(times, numbers, strict=True):
-        place = bisect_right(begins, moment) - 1
-        if place < len(marks) - 1:
-            entry = stages[marks[max(place, 0)][2]]
-            entry["one"] += number == 1
-            entry["many"] += number if number > 1 else 0
+def stages_of(marks):
+    """Processor time, wall time, serial time and largest memory of each stage of a run."""
+    stages = {}
+    for before, after in pairwise(marks):
+        entry = stages.setdefault(before["stage"], dict.fromkeys(("cpu", "wall", "waited", "peak"), 0.0))
+        for name in ("cpu", "wall", "waited"):
+            entry[name] += after[name] - before[name]
+        entry["peak"] = after["peak"]
+    stages[marks[0]["stage"]]["cpu"] += marks[0]["cpu"]
+    stages[marks[0]["stage"]]["wall"] += marks[0]["cpu"]
     for entry in stages.values():
-        entry["serial"] = entry["cpu"] * entry["one"] / max(entry["one"] + entry["many"], 1)
+        able = entry["cpu"] + entry["waited"]
+        entry["serial"] = min(max(2.0 * entry["wall"] - able, 0.0), entry["wall"]) * entry["cpu"] / max(able, 1e-9)
     return stages
 
 
@@ -137,11 +122,11 @@ def main():
     command = [sys.executable, __file__, arguments.images, "--model", arguments.model, "--row"]
     rounds = {1: [], 2: []}
     with tempfile.TemporaryDirectory() as bytecode:
-        watched([*command, "2"], bytecode)
+        alone([*command, "2"], bytecode)
         for _ in range(arguments.rounds):
             for threads, runs in rounds.items():
-                found, times, numbers = watched([*command, str(threads)], bytecode)
-                runs.append((stages_of(found, times, numbers), found))
+                found = alone([*command, str(threads)], bytecode)
+                runs.append((stages_of(found["marks"]), found))
     names = ("CPU 1", "wall 1", "MB 1", "CPU 2", "wall 2", "MB 2", "serial", "share")
     print(f"{'stage':28s} " + " ".join(f"{name:>7s}" for name in names))
     columns = [(1, "cpu"), (1, "wall"), (1, "peak"), (2, "cpu"), (2, "wall"), (2, "peak"), (2, "serial")]
