@@ -32,7 +32,7 @@ from pathlib import Path
 def run(images, model, threads):
     """Map, diagnose and write as the command does; return what was used until the beginning of each stage."""
     marks, waiting = [], {}
-    gc.set_threshold(10_000)  # as the command does
+    gc.set_threshold(50_000)  # as the command does
 
     def mark(stage, *_):
         if not marks or marks[-1]["stage"] != stage:
