@@ -261,7 +261,7 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
         adjusted = with_seen_ends(adjusted, np.unique(np.concatenate(moved)))
     outcome = _outcome(scene, assembly, problem, report, relations, stage_entries(stages, reports), residuals)
     if lens is not None:
-        found = lens() and lens().sentence, rig_that_does_not_fit(scene, problem, options.threads)
+        found = (shown := lens()) and shown.sentence, rig_that_does_not_fit(scene, problem, options.threads)
         outcome = replace(outcome, warnings=(*outcome.warnings, *filter(None, found)))
     _log(outcome)
     return AdjustResult(adjusted, outcome, problem)
