@@ -16,7 +16,7 @@ from groma.adjustment.assemble import Assembly, assemble, disassemble
 from groma.adjustment.assembly_options import SURFACE_SIGMA_PX, AssemblyOptions
 from groma.adjustment.fit import inliers, noise_of
 from groma.adjustment.misfit.calibration import doubtful_cameras, refuse_focal_lengths
-from groma.adjustment.misfit.lens import unmodelled_distortion
+from groma.adjustment.misfit.lens import begin_lens_test
 from groma.adjustment.misfit.rig import rig_that_does_not_fit
 from groma.adjustment.pixel_residuals import redundancy_of, squared_residuals_px
 from groma.adjustment.places import at_places_of
@@ -251,16 +251,16 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
             problem, renewed = with_held_states(problem, *without_slips(problem, options.threads))
             moved.append(renewed)
             if last and problem is not solution.problem:
-                reports[-1] = with_costs_at(reports[-1], problem)
-    report = combined(reports, assembly.problem, stages, options.line_loss_factor)
+                reports[-1] = with_costs_at(reports[-1], problem, layouts)
+    residuals = Residuals(problem)
+    lens = begin_lens_test(problem, options.threads, residuals) if options.check_lens else None
+    report = combined(reports, assembly.problem, stages, options.line_loss_factor, layouts)
     adjusted, relations = drop_failed_relations(disassemble(scene, problem), problem)
     if any(map(len, moved)):
         adjusted = with_seen_ends(adjusted, np.unique(np.concatenate(moved)))
-    entries, residuals = stage_entries(stages, reports), Residuals(problem)
-    outcome = _outcome(scene, assembly, problem, report, relations, entries, residuals)
-    if options.check_lens:
-        lens = unmodelled_distortion(problem, options.threads, residuals=residuals)
-        found = lens and lens.sentence, rig_that_does_not_fit(scene, problem, options.threads)
+    outcome = _outcome(scene, assembly, problem, report, relations, stage_entries(stages, reports), residuals)
+    if lens is not None:
+        found = (shown := lens()) and shown.sentence, rig_that_does_not_fit(scene, problem, options.threads)
         outcome = replace(outcome, warnings=(*outcome.warnings, *filter(None, found)))
     _log(outcome)
     return AdjustResult(adjusted, outcome, problem)

@@ -12,6 +12,7 @@ from groma.factors.contract import Factor
 from groma.factors.losses import Cauchy, Loss
 from groma.factors.losses import loss as make_loss
 from groma.gates import gate
+from groma.problem.lay_out import Layouts
 from groma.problem.problem import Problem
 from groma.solver.options import SolverOptions
 from groma.solver.report import Iteration, SolveReport
@@ -91,7 +92,11 @@ def stage_entries(stages: list[Loss], reports: list[SolveReport]) -> tuple[dict[
 
 
 def combined(
-    reports: list[SolveReport], start: Problem, stages: list[Loss], line_loss_factor: float = 1.0
+    reports: list[SolveReport],
+    start: Problem,
+    stages: list[Loss],
+    line_loss_factor: float = 1.0,
+    layouts: Layouts | None = None,
 ) -> SolveReport:
     """Return one report of all stages: costs under the last loss, times and steps summed."""
     last = reports[-1]
@@ -100,7 +105,7 @@ def combined(
     loss, first = stages[len(reports) - 1], reports[0]
     if loss != stages[0]:
         at_start = with_loss(start, loss, line_loss_factor=line_loss_factor)
-        first = solve(at_start, SolverOptions(max_iterations=0)).report
+        first = solve(at_start, SolverOptions(max_iterations=0), layouts=layouts).report
     return replace(one_after_another(reports), initial_cost=first.initial_cost, initial_costs=first.initial_costs)
 
 
@@ -118,7 +123,7 @@ def one_after_another(reports: list[SolveReport]) -> SolveReport:
     return replace(reports[-1], iterations=steps, history=history, seconds=seconds)
 
 
-def with_costs_at(report: SolveReport, problem: Problem) -> SolveReport:
+def with_costs_at(report: SolveReport, problem: Problem, layouts: Layouts | None = None) -> SolveReport:
     """Return the report of a solve with the costs of a problem that was changed after it."""
-    now = solve(problem, SolverOptions(max_iterations=0)).report
+    now = solve(problem, SolverOptions(max_iterations=0), layouts=layouts).report
     return replace(report, final_cost=now.final_cost, final_costs=now.final_costs)

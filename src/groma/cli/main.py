@@ -14,7 +14,7 @@ from io import TextIOWrapper
 
 #: New objects after which garbage is looked for; Python's own number is 700. Modules are a hundred thousand that stay.
 #: Cost: time only.
-_COLLECT_AFTER = 10_000
+_COLLECT_AFTER = 50_000
 
 
 def run(arguments: list[str] | None = None) -> int:

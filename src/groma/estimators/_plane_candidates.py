@@ -174,8 +174,8 @@ def from_segments(features: Features, num_points: int, gate: float) -> tuple[Flo
     count = min(PLANE_SEARCH.near_segments + 1, len(ends))
     near = np.asarray(kd_tree(middle).query(middle, k=count, workers=num_threads())[1], dtype=np.int64)
     first, second = np.repeat(np.arange(len(ends)), count - 1), near[:, 1:].ravel()
-    once = np.unique(np.column_stack([np.minimum(first, second), np.maximum(first, second)]), axis=0)
-    once = once[once[:, 0] != once[:, 1]]
+    keys = np.sort((np.minimum(first, second) * len(ends) + np.maximum(first, second))[first != second])
+    once = np.column_stack(np.divmod(keys[np.diff(keys, prepend=-1) > 0], len(ends)))
     chunks = [once[k : k + _CHUNK] for k in range(0, len(once), _CHUNK)]
     parts = map_in_threads(partial(_coplanar, features, corner, gate), chunks)
     pairs, planes, worth = (np.concatenate(column) for column in zip(*parts, strict=True))

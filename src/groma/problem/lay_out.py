@@ -64,19 +64,19 @@ class Layouts:
     """The last layout, for problems that are solved again at other states or under other losses."""
 
     def __init__(self) -> None:
-        self._last: tuple[Divided, Layout, str | tuple[str, ...]] | None = None
+        self._last: tuple[Problem, Layout, str | tuple[str, ...]] | None = None
 
-    def of(self, problem: Problem, eliminate: str | tuple[str, ...]) -> tuple[Divided, Layout]:
+    def of(self, problem: Problem, eliminate: str | tuple[str, ...] = "auto") -> tuple[Divided, Layout]:
         """Return the problem with its tied landmarks apart, and the layout of that."""
-        if self._last is not None:
-            parts, layout, as_before = self._last
-            if not parts.tied and eliminate == as_before and problem.has_structure_of(layout.problem):
-                self._last = Divided(problem, ()), _of_problem(layout, problem), eliminate
-                return self._last[:2]
-        self._last = None  # its memory is free for the next one
+        last, self._last = self._last, None  # its memory is free for the next one
         parts = with_tied_apart(problem, eliminate)
-        self._last = parts, lay_out(parts.problem, eliminate), eliminate
-        return self._last[:2]
+        if last is not None and last[2] == eliminate and problem.has_structure_of(last[0]):
+            layout = _of_problem(last[1], parts.problem)
+        else:
+            last = None
+            layout = lay_out(parts.problem, eliminate)
+        self._last = problem, layout, eliminate
+        return parts, layout
 
 
 def lay_out_landmarks(layout: Layout, groups: tuple[str, ...]) -> Layout:

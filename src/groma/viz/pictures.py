@@ -89,30 +89,36 @@ def read_picture(path: str | os.PathLike[str], max_size: int | None = None) -> P
         return None
     scale = 1.0 if max_size is None else max_size / max(picture.shape[:2])
     if scale < 1.0:
-        size = [max(1, round(scale * side)) for side in picture.shape[1::-1]]
-        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    return np.ascontiguousarray(picture[..., ::-1], dtype=np.uint8)
+        picture = _smaller(picture, scale)
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def data_address(picture: Picture) -> str:
     """Return a picture as the address of a JPEG that is its own content."""
     import cv2
 
-    encoded = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
+    colours = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+    encoded = cv2.imencode(".jpg", colours, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
     return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
 
 
 def jpeg_address(picture: Picture, budget: int) -> str:
     """Return a picture as a data address of at most about ``budget`` characters, made smaller until it fits."""
-    import cv2
-
     address = data_address(picture)
     for _ in range(4):
         if len(address) <= budget:
             break
         # A smaller picture has more detail in each pixel, so the bytes fall slower than the area.
         scale = max(0.9 * (budget / len(address)) ** 0.55, 0.2)
-        size = [max(1, round(scale * side)) for side in picture.shape[1::-1]]
-        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+        picture = _smaller(picture, scale)
         address = data_address(picture)
     return address
+
+
+def _smaller(picture: Picture, scale: float) -> Picture:
+    """Return a picture at a scale below one. From half of the size on, bilinear weights touch every pixel."""
+    import cv2
+
+    size = [max(1, round(scale * side)) for side in picture.shape[1::-1]]
+    how = cv2.INTER_LINEAR if scale >= 0.5 else cv2.INTER_AREA  # which takes fifteen times as long
+    return np.asarray(cv2.resize(picture, size, interpolation=how), np.uint8)

@@ -16,8 +16,9 @@ In comes an adjusted problem; out comes what is missing, or nothing. Two tests, 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from groma.adjustment.fit import FIT, noise_of
 from groma.adjustment.pixel_residuals import squared_length
 from groma.cameras import CameraModel, in_model
 from groma.cameras import model as camera_model
+from groma.execution import begin
 from groma.factors.contract import Factor, Ref
 from groma.factors.observations.point_reprojection import PointReprojection
 from groma.gates import chi_square_gate, gate
@@ -126,6 +128,11 @@ def unmodelled_distortion(
         return None
     models = sorted({factor.camera.name for factor in seen})
     return Lens(tuple(models), tuple(sorted({model.name for model in groups.values()})), before, after)
+
+
+def begin_lens_test(problem: Problem, threads: int | None, residuals: Residuals) -> Callable[[], Lens | None]:
+    """Begin what :func:`unmodelled_distortion` does, and return what gives its result; other work goes on meanwhile."""
+    return begin(partial(unmodelled_distortion, problem, threads, residuals=residuals))
 
 
 def radial_field(

@@ -184,7 +184,6 @@ def map_(
     from groma.execution import work_with
     from groma.features.external import read_matches
     from groma.io import read_scene
-    from groma.localization.extension import in_world_of
     from groma.mapping.lines.options import MapLinesOptions
     from groma.mapping.options import MapOptions
 
@@ -223,6 +222,8 @@ def map_(
     with work_with(console.threads):
         result = run_map(console, photographs, work, start, options, matches, survey, maps)
         if extended is not None and survey is None:
+            from groma.localization.extension import in_world_of
+
             result = in_world_of(result, extended.map)
         page = {"images": photographs, "photographs": result.photographs(photographs)}
         found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -23,7 +24,7 @@ from groma import cameras as camera_models
 from groma._typing import FloatArray
 from groma.errors import FileFormatError, InputError, OutputError
 from groma.io.atomic import atomic_output
-from groma.io.colmap.binary_points import write_points
+from groma.io.colmap.binary_points import POINT_IN_SPACE, points_in_space, write_points
 from groma.io.colmap.files import (
     POINT,
     check_binary_model,
@@ -73,14 +74,14 @@ def read_colmap(path: str | os.PathLike[str]) -> Scene:
     folder, form = find_model(path)
     pycolmap = load_pycolmap()
     with reading(folder, _KIND), quiet(pycolmap):
-        reconstruction, seen = pycolmap.Reconstruction(), None
+        reconstruction, seen, points = pycolmap.Reconstruction(), None, None
         if form == "binary":
             check_binary_model(folder, _num_params_by_number(pycolmap))
             reconstruction.read_binary(str(folder))
-            seen = points_in_images(folder / "images.bin")
+            seen, points = points_in_images(folder / "images.bin"), points_in_space(folder / "points3D.bin")
         else:
             _read_text(reconstruction, folder)
-        scene = _scene_of(reconstruction, seen)
+        scene = _scene_of(reconstruction, seen, points)
         if form == "text":
             whole = _spaced_names(folder / "images.txt")
             pairs = zip(scene.images.ids.tolist(), scene.images.names, strict=True)
@@ -117,8 +118,12 @@ def from_pycolmap(reconstruction: pycolmap.Reconstruction) -> Scene:
     return _scene_of(reconstruction)
 
 
-def _scene_of(reconstruction: pycolmap.Reconstruction, seen: Mapping[int, np.ndarray] | None = None) -> Scene:
-    """Do it; ``seen`` are the 2D points of each image, where they are known otherwise."""
+def _scene_of(
+    reconstruction: pycolmap.Reconstruction,
+    seen: Mapping[int, np.ndarray] | None = None,
+    in_space: np.ndarray | None = None,
+) -> Scene:
+    """Do it; ``seen`` are the 2D points of each image and ``in_space`` the points, where they are known otherwise."""
     cameras = _cameras(reconstruction)
     camera_row = _rows(cameras.ids)
     rigs = Rigs(np.array(sorted(reconstruction.rigs), np.int64))
@@ -150,7 +155,7 @@ def _scene_of(reconstruction: pycolmap.Reconstruction, seen: Mapping[int, np.nda
         frame_idx=np.array([frame_row[image.frame_id] for _, image in posed], np.int64),
         sensor_idx=np.array([sensor_row[rig_row[image.frame.rig_id], image.camera_id] for _, image in posed], np.int64),
     )
-    points = _points(reconstruction)
+    points = _points(_in_space(reconstruction) if in_space is None else in_space)
     found = [seen[number] if seen else _seen_in(image) for number, image in posed]
     observations, keypoints = _observations(found, points)
     return Scene(cameras, rigs, sensors, frames, images, points, observations, keypoints)
@@ -212,16 +217,21 @@ def _sensors(reconstruction: pycolmap.Reconstruction, rigs: Rigs, camera_row: di
     )
 
 
-def _points(reconstruction: pycolmap.Reconstruction) -> Points:
-    found = sorted(reconstruction.points3D.items())
-    if found and found[-1][0] > 2**63 - 1:
-        raise FileFormatError(f"Point identifier {found[-1][0]} is too large.")
+def _points(found: np.ndarray) -> Points:
+    """The table of points from those of a model, by their identifiers."""
+    if len(found) and found["id"][-1] > 2**63 - 1:
+        raise FileFormatError(f"Point identifier {found['id'][-1]} is too large.")
     return Points(
-        ids=np.array([number for number, _ in found], np.int64),
-        xyz=np.array([point.xyz for _, point in found], float).reshape(-1, 3),
-        color=np.array([point.color for _, point in found], np.uint8).reshape(-1, 3),
-        error=np.array([point.error for _, point in found], float),
+        found["id"].astype(np.int64), *(np.ascontiguousarray(found[name]) for name in ("xyz", "color", "error"))
     )
+
+
+def _in_space(reconstruction: pycolmap.Reconstruction) -> np.ndarray:
+    """The points of a model, by their identifiers."""
+    table = np.zeros(len(reconstruction.points3D), POINT_IN_SPACE)
+    for row, (number, point) in enumerate(sorted(reconstruction.points3D.items(), key=itemgetter(0))):
+        table[row] = number, point.xyz, point.color, point.error, 0
+    return table
 
 
 def _seen_in(image: Any) -> np.ndarray:

@@ -26,13 +26,12 @@ import numpy as np
 
 from groma._typing import IntArray
 from groma.errors import InputError
-from groma.execution import begin, work_with
+from groma.execution import work_with
 from groma.features.matches import LineMatches
 from groma.features.segments import Segments
 from groma.mapping.lines.by_clusters import map_lines_by_clusters
 from groma.mapping.lines.collect import line_map_of
 from groma.mapping.lines.filtering.filters import Evidence, filtered
-from groma.mapping.lines.filtering.texture import load_minimiser
 from groma.mapping.lines.hypotheses.directions import depth_ratios
 from groma.mapping.lines.hypotheses.earlier import EarlierMap
 from groma.mapping.lines.hypotheses.places import find_places
@@ -119,7 +118,6 @@ def map_lines(
         else:
             ratios = depth_ratios(scene, segments, views)
         proposing, linking = partial(report, "proposing lines"), partial(report, "linking segments")
-        begin(load_minimiser)
         places = find_places(scene, views, ratios, compared, matches, options, proposing, known)
         unmerged = grow(Tracks.none(views, places.rejection), places, compared, options, linking)
         evidence = Evidence(

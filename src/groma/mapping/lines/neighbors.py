@@ -104,17 +104,21 @@ class _Shared:
         others, counts = others[order], counts[order]
         seen = np.zeros(len(self.xyz), bool)
         seen[self._seen_by(i)] = True
-        safe = np.maximum(np.array([self._angle(i, int(j), seen) for j in others]), 1e-6)
+        safe = np.maximum(self._angles(i, others, seen), 1e-6)
         low, high = np.deg2rad(GATES.min_angle_deg), np.deg2rad(GATES.max_angle_deg)
         score = counts * np.minimum(1.0, safe / low) * np.minimum(1.0, high / safe)
         return others[np.argsort(-score, kind="stable")[:num]].astype(np.int64)
 
-    def _angle(self, i: int, j: int, seen: BoolArray) -> float:
-        """Median angle under which rays of shared points meet; ``seen`` (P,) tells the points that image i sees."""
-        common = self._seen_by(j)
-        common = common[seen[common]]
-        xyz = self.xyz[common[:: max(1, len(common) // GATES.sample)]]
-        return float(np.median(_angles(xyz - self.centers[i], xyz - self.centers[j])))
+    def _angles(self, i: int, others: IntArray, seen: BoolArray) -> FloatArray:
+        """Median angles (N,) under which rays of shared points meet; ``seen`` (P,): the points that image i sees."""
+        shared = [common[seen[common]] for common in map(self._seen_by, others.tolist())]
+        shared = [common[:: max(1, len(common) // GATES.sample)] for common in shared]
+        count = np.array([len(common) for common in shared], np.int64)
+        owner, last = np.repeat(np.arange(len(others)), count), np.cumsum(count)
+        xyz = self.xyz[np.concatenate([np.zeros(0, np.int64), *shared])]
+        angles = _angles(xyz - self.centers[i], xyz - self.centers[others[owner]])
+        angles = angles[np.lexsort((angles, owner))]
+        return 0.5 * (angles[last - (count + 1) // 2] + angles[last - count // 2 - 1])
 
     def _seen_by(self, image: int) -> IntArray:
         return self.sees.indices[self.sees.indptr[image] : self.sees.indptr[image + 1]]

@@ -18,7 +18,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.association import inlier_probability
 from groma.estimators.membership import Candidates, memberships
 from groma.estimators.plane_search import BAND, PlaneSet, connected_to
-from groma.execution import map_in_threads, num_threads
+from groma.execution import map_in_threads, num_threads, together
 from groma.gates import chi_square_gate, gate
 from groma.geometry.algebra import dot, norm
 from groma.mapping.groups import distinct_pairs
@@ -173,8 +173,8 @@ def on_planes(
         GATES.widest * half / typical,
     )
     competing = np.arccos(np.clip(np.abs(found.planes[:, :3] @ found.planes[:, :3].T), 0.0, 1.0)) < GATES.competing
-    results = []
-    for rows, dof, enough in ((~is_line, 1, least[0]), (is_line, 2, least[1])):
+
+    def related(rows: BoolArray, dof: int, enough: float) -> Pairs:
         deviation = told.deviation[owner[rows]]
         inner = _on_plane_itself(table[rows], found.band, dof, level, enough)
         squared = table[rows, 4 : 4 + dof] ** 2 / (table[rows, 6 : 6 + dof] + (deviation * pixel[rows])[:, None] ** 2)
@@ -182,8 +182,10 @@ def on_planes(
         probability = np.where(inner > 0.0, np.maximum(inner, told.probability[rows]), told.probability[rows])
         pairs = np.column_stack([mark, owner])[rows]
         chosen = Pairs(pairs, probability, np.where(inner > 0.0, 0.0, deviation)).take(passed | (inner > 0.0))
-        results.append(_best_of_competing(chosen, competing, num))
-    return results[0], results[1]
+        return _best_of_competing(chosen, competing, num)
+
+    points_on, lines_on = together(partial(related, ~is_line, 1, least[0]), partial(related, is_line, 2, least[1]))
+    return points_on, lines_on
 
 
 def _on_plane_itself(table: FloatArray, band: FloatArray, dof: int, level: float, least: float) -> FloatArray:

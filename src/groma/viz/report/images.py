@@ -20,7 +20,7 @@ from groma.viz.drawable import Drawable
 from groma.viz.pack import pack, pack_whole, thin
 from groma.viz.pictures import ImageFiles, image_file, jpeg_address, read_picture, warn_of_names_outside
 from groma.viz.report.kept import Kept, places_of
-from groma.viz.report.overlays import is_straight, projected_segments
+from groma.viz.report.overlays import is_straight, projected_places
 
 #: Photographs in the page, the longer side of each, pixels, and what all of them may weigh, characters.
 MAX_PHOTOS = 60
@@ -134,12 +134,15 @@ def _by_image(rows: IntArray, image_idx: IntArray, num_images: int) -> list[IntA
 def _projected(scene: Scene, image: int, lines: IntArray, samples: int) -> FloatArray:
     """Return the images of 3D segments (n, 2 * samples); zeros where they are not before the camera."""
     found = np.zeros((len(lines), samples, 2))
-    for row, places in enumerate(projected_segments(scene, image, lines) if len(lines) else []):
-        if len(places) == samples:
-            found[row] = places
-        elif len(places) >= 2:
-            at = np.linspace(0.0, len(places) - 1.0, samples)
-            found[row] = np.stack([np.interp(at, np.arange(len(places)), places[:, axis]) for axis in (0, 1)], axis=1)
+    places, seen = projected_places(scene, image, lines) if len(lines) else (found, np.ones((0, samples), bool))
+    rest = seen.sum(axis=1) >= 2
+    if places.shape[1] == samples:
+        whole = seen.all(axis=1)
+        found[whole], rest = places[whole], rest & ~whole
+    for row in np.flatnonzero(rest).tolist():
+        way = places[row, seen[row]]
+        at = np.linspace(0.0, len(way) - 1.0, samples)
+        found[row] = np.stack([np.interp(at, np.arange(len(way)), way[:, axis]) for axis in (0, 1)], axis=1)
     width, height = scene.cameras.width, scene.cameras.height
     size = float(max(width.max(initial=0), height.max(initial=0))) or np.inf
     # Far outside, models of distortion are not meant to be used.

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from groma import cameras
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
 from groma.geometry import se3
 from groma.scene import Scene
@@ -122,7 +122,12 @@ def is_straight(model: str) -> bool:
 
 
 def projected_segments(scene: Scene, image_idx: int, line_idx: IntArray) -> list[FloatArray]:
-    """Return the images of 3D segments as polylines (n, 2) in pixels; empty ones for segments behind the camera.
+    """Return the images of 3D segments as polylines (n, 2) in pixels; empty ones for segments behind the camera."""
+    return [row[kept] for row, kept in zip(*projected_places(scene, image_idx, line_idx), strict=True)]
+
+
+def projected_places(scene: Scene, image_idx: int, line_idx: IntArray) -> tuple[FloatArray, BoolArray]:
+    """Return places along the images of 3D segments (N, n, 2) in pixels, and which of them are seen (N, n).
 
     Parameters
     ----------
@@ -152,7 +157,7 @@ def projected_segments(scene: Scene, image_idx: int, line_idx: IntArray) -> list
         ways = model.pixel_difference(params, pixels[:, 1:].reshape(-1, 2), pixels[:, :-1].reshape(-1, 2))
         pixels[:, 1:] = pixels[:, :1] + np.cumsum(ways.reshape(len(pixels), -1, 2), axis=1)
     good = np.isfinite(pixels).all(axis=2) & (depth.max(axis=1) > near)[:, None]
-    return [row[kept] for row, kept in zip(pixels, good, strict=True)]
+    return pixels, good
 
 
 def observation_crop(
