@@ -21,7 +21,6 @@ from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.places import at_places_of
 from groma.adjustment.survey.align import align
 from groma.adjustment.survey.attach import Survey, with_survey
-from groma.adjustment.survey.names import rows_by_name, tell_partly
 from groma.adjustment.survey.reliability import reliability
 from groma.adjustment.survey.similarity import robust_similarity
 from groma.errors import InputError
@@ -149,16 +148,6 @@ def test_gross_errors_do_not_move_the_similarity():
     assert np.flatnonzero(~found.inliers).tolist() == wrong
     assert found.scatter == pytest.approx(0.01, rel=0.35)
     assert found.similarity.scale == pytest.approx(ELSEWHERE.scale, abs=0.001)
-
-
-def test_names_are_found_without_folder_and_ending():
-    known = ("left/a.JPG", "left/b.jpg", "right/b.jpg", "c.png")
-    wanted = ["A.jpg", "right\\b.jpg", "b.jpg", "c", "c.jpg", "d"]
-    found = rows_by_name(wanted, known)
-    assert found.tolist() == [0, 2, -1, 3, 3, -1]
-    words = "p.csv: 3 names of images were found without folder or ending, such as A.jpg for left/a.JPG."
-    assert tell_partly(found, wanted, known, "p.csv") == [words]
-    assert tell_partly(found[1:3], wanted[1:3], known, "p.csv") == []
 
 
 def refused(scene, words, **survey):

@@ -130,6 +130,14 @@ def test_images_are_matched_by_name():
     other = truth.replace(images=truth.images.replace(names=tuple(f"x{row}" for row in range(10))))
     with pytest.raises(InputError, match=r"'x0' and '00001.png'"):
         evaluate_poses(other, truth)
+    inside = truth.replace(images=truth.images.replace(names=tuple(f"images/{name}" for name in truth.images.names)))
+    scores = evaluate_poses(truth, inside)
+    assert (scores.num_images, scores.center_rmse) == (10, pytest.approx(0, abs=1e-12))
+    assert "10 names of images were found without folder" in scores.warnings[0]
+    folders = truth.replace(images=truth.images.replace(names=tuple(f"{row}/1.png" for row in range(10))))
+    alone = truth.subset([0]).replace(images=truth.subset([0]).images.replace(names=("1.png",)))
+    with pytest.raises(InputError, match="More than one image of the reference"):
+        evaluate_poses(alone, folders)
     twins = truth.replace(images=truth.images.replace(names=("a",) * 10))
     with pytest.raises(InputError, match="not unique"):
         evaluate_poses(twins, truth)
@@ -138,7 +146,7 @@ def test_images_are_matched_by_name():
 def test_scenes_that_hardly_share_images_or_share_names_alone_are_warned_of():
     scene = holistic(12, seed=3).start
     names = [f"{k}.png" for k in range(12)]
-    renamed = scene.replace(images=scene.images.replace(names=tuple(names[:3] + [f"other/{n}" for n in names[3:]])))
+    renamed = scene.replace(images=scene.images.replace(names=tuple(names[:3] + [f"other {n}" for n in names[3:]])))
     scene = scene.replace(images=scene.images.replace(names=tuple(names)))
     scores = evaluate_poses(renamed, scene)
     assert scores.num_images == 3 and "Only 3 of 12 and 12 images" in scores.warnings[0]

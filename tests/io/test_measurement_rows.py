@@ -52,7 +52,7 @@ def test_poses_with_covariances(tmp_path):
     assert holds_covariances(path) and read_camera_poses(path, ["a"]).names == ("a", "b", "c", "d")
     # the same file places photographs
     poses = read_poses(path, ["x/a.jpg", "y/b.jpg", "other.jpg"])
-    assert poses.names == ("x/a.jpg", "y/b.jpg") and "names without the endings" in poses.sentences[0]
+    assert poses.names == ("x/a.jpg", "y/b.jpg") and "without folder or ending" in poses.sentences[0]
     np.testing.assert_allclose(poses.cam_from_world[0, :4], [0, 0, -0.6, 0.8])
 
 

@@ -51,19 +51,24 @@ def test_models_give_poses_and_calibration_by_name(tmp_path, scene):
         assert found.cameras is not None and found.cameras.models[found.camera_idx[0]] == "SIMPLE_PINHOLE"
         assert found.sentences == ()
     inner = read_poses(tmp_path / "model", [f"left/{name}" for name in NAMES])
-    assert inner.names[0] == "left/frame_1.jpg" and inner.sentences == (
-        "Photographs were found by the last part of their paths.",
-    )
+    assert inner.names[0] == "left/frame_1.jpg"
+    words = "6 names of images were found without folder or ending, such as frame_1.jpg for left/frame_1.jpg."
+    assert inner.sentences == (f"{tmp_path / 'model'}: {words}",)
     converted = read_poses(tmp_path / "model", [f"{name[:-4]}.PNG" for name in NAMES[1:]])
-    assert converted.names[0] == "frame_2.PNG" and "without the endings" in converted.sentences[0]
+    assert converted.names[0] == "frame_2.PNG" and "without folder or ending" in converted.sentences[0]
     assert "1 of 6 poses in" in converted.sentences[1] and "'frame_1.jpg'" in converted.sentences[1]
+    # A folder around all, as in transforms.json of other programs, and files of one name in two folders.
+    names = tuple(f"images/{k % 2}/{k // 2}.jpg" for k in range(COUNT))
+    write_colmap(scene.replace(images=scene.images.replace(names=names)), tmp_path / "around")
+    there = [name.removeprefix("images/") for name in names[:4]]
+    agree(read_poses(tmp_path / "around", there), there, scene.cam_from_world[:4])
 
 
 def test_names_that_do_not_tell_are_refused(tmp_path, scene):
     write_colmap(scene, tmp_path / "model")
     with pytest.raises(InputError, match=r"None of the 6 names .* 'frame_1.jpg', here 'a.jpg'"):
         read_poses(tmp_path / "model", ["a.jpg"])
-    with pytest.raises(InputError, match=r"photographs 'a/frame_1.jpg' and 'b/frame_1.jpg' both fit"):
+    with pytest.raises(InputError, match=r"which pose in .* is whose: .* fits 'frame_1.jpg'"):
         read_poses(tmp_path / "model", ["a/frame_1.jpg", "b/frame_1.jpg"])
     twice = scene.replace(images=scene.images.replace(names=tuple(f"{k}/frame_1.jpg" for k in range(COUNT))))
     write_colmap(twice, tmp_path / "twice")

@@ -38,6 +38,24 @@ def test_every_kind_of_image_is_read_as_it_is_stored(tmp_path):
         assert np.abs(read_gray(path).astype(int) - grey).max() <= 4, path.name
 
 
+def test_folders_are_looked_into_unless_they_are_hidden(tmp_path):
+    for name in ("b/c/2.JPG", "b/1.jpg", "a.png", ".thumbnails/a.png", "b/.trash/deep/3.jpg", "b/.jpg", "b/notes.txt"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "folder.png").mkdir()
+    assert [path.relative_to(tmp_path).as_posix() for path in image_files(tmp_path)] == [
+        "a.png",
+        "b/1.jpg",
+        "b/c/2.JPG",
+    ]
+
+
+def test_the_whole_disk_is_no_folder_of_images(monkeypatch):
+    monkeypatch.setattr(os, "walk", None)  # it is not even looked at
+    with pytest.raises(InputError, match=r"is the whole disk, .* Pass the folder that holds the photographs"):
+        image_files(Path(Path.cwd().anchor))
+
+
 @pytest.mark.skipif(os.name == "nt" or os.uname().sysname == "Darwin", reason="such names cannot be made")
 @pytest.mark.parametrize("name", [b"bad\xff.png", b"two\nlines.png", b"in\x1b/a.png"])
 def test_names_that_are_no_text_are_refused(tmp_path, name):

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from groma._image_names import rows_by_name
 from groma._typing import FloatArray
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult
@@ -168,8 +169,8 @@ def _distances(poses: FloatArray, others: FloatArray) -> FloatArray:
 
 
 def _errors(scene: Scene, reference: Scene) -> FloatArray:
-    row = {name: k for k, name in enumerate(scene.images.names)}
-    pairs = [(row[name], k) for k, name in enumerate(reference.images.names) if name in row]
+    rows = rows_by_name(reference.images.names, scene.images.names).tolist()
+    pairs = [(row, k) for k, row in enumerate(rows) if row >= 0]
     mine, true = np.array(pairs).T
     return _distances(scene.cam_from_world[mine], reference.cam_from_world[true])
 

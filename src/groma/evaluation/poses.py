@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from groma._image_names import rows_by_name, tell_partly
 from groma._typing import FloatArray
 from groma.errors import InputError
 from groma.evaluation.alignment import align_poses, camera_centers
@@ -61,7 +62,9 @@ def as_numbers(scores: Any, *left_out: str) -> dict[str, object]:
 
 
 def evaluate_poses(estimate: Scene, reference: Scene) -> PoseScores:
-    """Compare the camera poses of two scenes, aligned by a similarity; images are matched by name.
+    """Compare the camera poses of two scenes, aligned by a similarity.
+
+    Images are matched by name, without folder or ending where that tells one from all others.
 
     Parameters
     ----------
@@ -75,24 +78,24 @@ def evaluate_poses(estimate: Scene, reference: Scene) -> PoseScores:
     """
     check_scene_given(estimate, "estimate")
     check_scene_given(reference, "reference")
-    rows = []
     for name, scene in (("estimate", estimate), ("reference", reference)):
-        index = {image: row for row, image in enumerate(scene.images.names)}
-        if len(index) != scene.num_images:
+        if len(set(scene.images.names)) != scene.num_images:
             raise InputError(f"Image names of the {name} are not unique; images are matched by name. Rename them.")
-        if not index:
+        if not scene.num_images:
             raise InputError(f"The {name} holds no images, so there are no poses to compare. Pass a scene with images.")
-        rows.append(index)
-    common = [name for name in reference.images.names if name in rows[0]]
-    if not common:
-        examples = [next(iter(index)) for index in rows]
+    wanted, known = reference.images.names, estimate.images.names
+    found = rows_by_name(wanted, known)
+    common = np.flatnonzero(found >= 0)
+    rows = found[common]
+    if not len(common) or len(np.unique(rows)) < len(common):
+        which = "No image is in both scenes" if not len(common) else "More than one image of the reference fits another"
         raise InputError(
-            f"No image is in both scenes; names are for example {examples[0]!r} and {examples[1]!r}. "
+            f"{which}; names are for example {known[0]!r} and {wanted[0]!r}. "
             "Images are matched by name: rename those of one scene."
         )
-    estimated = estimate.cam_from_world[[rows[0][name] for name in common]]
-    true = reference.cam_from_world[[rows[1][name] for name in common]]
+    estimated, true = estimate.cam_from_world[rows], reference.cam_from_world[common]
     scores = score_poses(estimated, true, num_missing=reference.num_images - len(common))
+    scores = replace(scores, warnings=(*tell_partly(found, wanted, known, "reference"), *scores.warnings))
     least = min(scene.num_images for scene in (estimate, reference))
     if len(common) >= SCORES.associated * least:
         return scores

@@ -2,8 +2,8 @@
 """Poses of photographs from any file that holds some: which pose belongs to which photograph.
 
 ===============================================  ===================================================================
-a model: COLMAP, ``transforms.json``,            images are found by name: the whole path, else its end, else the
-OpenSfM, OpenMVG, VisualSFM, an archive          name without its ending, wherever exactly one photograph fits
+a model: COLMAP, ``transforms.json``,            images are found by name: the whole path, else its end, else
+OpenSfM, OpenMVG, VisualSFM, an archive          without ending, else in another folder, if just one photograph fits
 a trajectory of TUM or EuRoC                     where the names of the photographs are times: the nearest within 20
                                                  ms; else in order, if there are as many of both
 a trajectory of KITTI                            in order, if there are as many; else the numbers in the names are
@@ -21,13 +21,14 @@ import os
 import posixpath
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from groma._counted import counted, natural_key
+from groma._image_names import SEVERAL, rows_by_name, tell_partly
 from groma._typing import FloatArray, IntArray
 from groma.bounded.text import read_lines
 from groma.errors import InputError
@@ -189,32 +190,22 @@ def _unclear(place: Path, count: int, names: Sequence[str], what: str) -> InputE
 # ------------------------------------------------------------------------------------------------------------- names
 def _by_name(place: Path, names: Sequence[str], photographs: Sequence[str]) -> tuple[list[str | None], tuple[str, ...]]:
     """Return the photograph of each name, None where there is none, and what was concluded."""
-    ways: tuple[tuple[str, Callable[[str], str]], ...] = (
-        ("", lambda name: name),
-        ("the last part of their paths", posixpath.basename),
-        ("their names without the endings", lambda name: posixpath.splitext(posixpath.basename(name))[0].lower()),
-    )
-    for said, key in ways:
-        by_key: dict[str, list[str]] = {}
-        for photograph in photographs:
-            by_key.setdefault(key(photograph), []).append(photograph)
-        found = [by_key.get(key(name.replace("\\", "/")), []) for name in names]
-        if not any(found):
-            continue
-        twice = next((one for one in found if len(one) > 1), None)
-        if twice is not None:
-            raise InputError(
-                f"It cannot be told which pose in {place} is whose: the photographs {twice[0]!r} and {twice[1]!r} both "
-                "fit one of its names. Use whole paths in the file."
-            )
-        again = Counter(one[0] for one in found if one).most_common(1)[0]
-        if again[1] > 1:
-            raise InputError(f"{place} has {again[1]} poses for the photograph {again[0]!r}. Remove the wrong ones.")
-        return [one[0] if one else None for one in found], (f"Photographs were found by {said}.",) if said else ()
-    raise InputError(
-        f"None of the {counted(len(names), 'names')} in {place} is that of a photograph: there it is for example "
-        f"{names[0]!r}, here {photographs[0]!r}. Pass the folder that the file belongs to, or rename."
-    )
+    rows = rows_by_name(names, photographs)
+    if (unclear := np.flatnonzero(rows == SEVERAL)).size:
+        raise InputError(
+            f"It cannot be told which pose in {place} is whose: more than one photograph, or more than one name of the "
+            f"file, fits {names[unclear[0]]!r}. Use whole paths in the file."
+        )
+    found = [photographs[int(row)] if row >= 0 else None for row in rows]
+    again = Counter(name for name in found if name is not None).most_common(1)
+    if not again:
+        raise InputError(
+            f"None of the {counted(len(names), 'names')} in {place} is that of a photograph: there it is for example "
+            f"{names[0]!r}, here {photographs[0]!r}. Pass the folder that the file belongs to, or rename."
+        )
+    if again[0][1] > 1:
+        raise InputError(f"{place} has {again[0][1]} poses for the photograph {again[0][0]!r}. Remove the wrong ones.")
+    return found, tuple(tell_partly(rows, names, photographs, str(place)))
 
 
 def _stems(names: Sequence[str]) -> list[str]:

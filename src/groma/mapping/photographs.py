@@ -7,6 +7,7 @@ camera of a model has the size of the stored image.
 
 from __future__ import annotations
 
+import os
 import posixpath
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -29,19 +30,23 @@ _START_OF_SCAN, _END_OF_IMAGE = b"\xff\xda", b"\xff\xd9"
 
 
 def image_files(folder: Path) -> list[Path]:
-    """Return the images in a folder and its sub-folders, sorted; hidden files are not looked at."""
+    """Return the images in a folder and its sub-folders, sorted; hidden ones are not looked at, nor into."""
     if not folder.is_dir():
         what = "is a file, not a folder of images" if folder.exists() else "is not a folder of images"
         video = folder.suffix.lower() in VIDEOS
         remedy = "Take pictures out of it, or follow it with groma track." if video else "Check the path."
         raise InputError(f"{folder} {what}. {remedy}")
-    files = sorted(
-        path
-        for path in folder.rglob("*")
-        if path.suffix.lower() in IMAGES
-        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
-        and path.is_file()
-    )
+    if folder.resolve() == folder.resolve().parent:
+        raise InputError(
+            f"{folder} is the whole disk, not a folder of images: every picture on it would be taken. Pass the folder "
+            "that holds the photographs."
+        )
+    files: list[Path] = []
+    for place, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        pictures = [name for name in names if not name.startswith(".") and name.lower().endswith(IMAGES)]
+        files += [path for name in pictures if (path := Path(place, name)).is_file()]
+    files.sort()
     if not files:
         raise InputError(f"{folder} holds no images ({', '.join(IMAGES)}). Check the path.")
     wrong = next((name for path in files if not is_text(name := path.relative_to(folder).as_posix())), None)

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from groma._image_names import rows_by_name
 from groma._typing import BoolArray, FloatArray
 from groma.adjustment.survey.attach import with_survey
 from groma.adjustment.survey.given import Survey
-from groma.adjustment.survey.names import require_some, rows_by_name
+from groma.adjustment.survey.names import require_some
 from groma.adjustment.survey.similarity import robust_similarity
 from groma.errors import InputError
 from groma.evaluation.alignment import camera_centers, pose_alignment

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from groma._image_names import rows_by_name
 from groma._typing import FloatArray
 from groma.adjustment.survey.given import Survey
 from groma.adjustment.survey.level import check_directions, level
-from groma.adjustment.survey.names import rows_by_name
 from groma.adjustment.survey.orientations import check_orientations
 from groma.adjustment.survey.place import measured_at_places
 from groma.adjustment.survey.similarity import GATES, RobustSimilarity, robust_similarity, upright

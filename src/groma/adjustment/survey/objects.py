@@ -15,13 +15,14 @@ from fnmatch import fnmatchcase
 import numpy as np
 
 from groma._counted import counted, first_of
+from groma._image_names import rows_by_name, tell_partly
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.fit import noise_of
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.adjustment.survey.given import Survey
-from groma.adjustment.survey.names import nearest, rows_by_name, tell_partly
+from groma.adjustment.survey.names import nearest
 from groma.adjustment.terms.objects import GROUPS
 from groma.errors import InputError
 from groma.gates import gate

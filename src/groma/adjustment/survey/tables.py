@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from groma._counted import counted, first_of
+from groma._image_names import rows_by_name, tell_partly
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.survey.given import Survey
-from groma.adjustment.survey.names import nearest, require_some, rows_by_name, tell_partly
+from groma.adjustment.survey.names import nearest, require_some
 from groma.errors import InputError
 from groma.io.survey import ControlFile, Places
 from groma.scene import CameraPositions, ControlPoints, Marks, Scene
