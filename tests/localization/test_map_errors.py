@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Errors of a map beside the noise of its landmarks: what they are, and that poses in the map know of them."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from groma.adjustment.assemble import assemble
@@ -13,7 +15,7 @@ from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.left_out import without_image
 from groma.localization.pose.map_errors import SeenByImage, images_compared, shared_errors
 from groma.localization.pose.matches import Matches
-from groma.localization.pose.records import landmark_covariances
+from groma.localization.pose.records import landmark_covariances, motions_of_lines
 from groma.localization.pose.refinement import refine
 from groma.scene.synthetic import holistic
 from groma.solver.options import SolverOptions
@@ -126,6 +128,21 @@ def test_an_image_is_taken_out_of_its_points():
         # A step is many times larger than what it leaves to the other solve.
         step, rest = (np.linalg.norm(one - after, axis=-1).mean() for one in (before[known], expected))
         assert rest < 0.1 * step, (kind, rest, step)
+
+
+def test_lines_that_are_hardly_determined_are_left_out():
+    """Their information is at the limit of rounding, where its sign is chance; points stay as they are."""
+    world, image = _Map(3), 4
+    every = world.matches(image)
+    one, two = np.moveaxis(every.segments3d, 1, 0)
+    way = (two - one) / np.linalg.norm(two - one, axis=1, keepdims=True)
+    free = motions_of_lines(np.concatenate([np.cross(one, way), way], axis=1))
+    hardly = np.einsum("nij,nj->ni", free, np.random.default_rng(0).normal(size=(len(free), 4)))
+    wide = every.line_covariance + 1e15 * every.line_covariance.max() * hardly[:, :, None] * hardly[:, None]
+    left = without_image(world.camera(image), replace(every, line_covariance=wide), world.poses[image])
+    expected = without_image(world.camera(image), every, world.poses[image])
+    assert every.num_lines > 5 and left.num_lines == 0
+    np.testing.assert_array_equal(left.points3d, expected.points3d)
 
 
 def _queries(turn):

@@ -176,6 +176,15 @@ def test_frames_without_a_pose_are_named():
     assert any("No pose: 1 frame of 8: 0005.png." in sentence for sentence in result.warnings)
 
 
+def test_the_first_frame_of_one_camera_is_not_named_once_it_has_a_pose():
+    frames = _room.frames("mono", _room.poses(14))
+    result = groma.track(_Rendered(frames, kind="mono"), OPTIONS)
+    with_pose = set(result.trajectory.timestamps.tolist())
+    assert result.frames[0].pose is None and frames[0].timestamp in with_pose
+    without = [frame.name for frame in frames if frame.timestamp not in with_pose]
+    assert without and result.summary()["frames_without_pose"] == without
+
+
 def _turned(degrees: float, sideways: float) -> np.ndarray:
     twist = np.zeros((1, 6))
     twist[0, 4] = np.radians(degrees)

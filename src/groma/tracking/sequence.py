@@ -85,7 +85,14 @@ class SequenceResult(TrackResult):
             numbers["sources"] = list(self.sources)
         if len(self.sources) == 1:
             numbers["images"] = self.sources[0]["path"]  # where groma localize looks for them
-        numbers["frames_without_pose"] = [frame.name for frame in self.frames if frame.pose is None]
+        # The first frame of one camera has a pose once the map begins, after its answer.
+        placed = [self.trajectory, *(submap.trajectory for submap in self.submaps)]
+        times = {time for trajectory in placed for time in trajectory.timestamps.tolist()}
+        numbers["frames_without_pose"] = [
+            frame.name
+            for frame in self.frames
+            if frame.pose is None and (frame.status == SKIPPED or frame.timestamp not in times)
+        ]
         if self.scores is not None:
             numbers["reference"] = self.scores.to_dict()
         elif self.not_compared:

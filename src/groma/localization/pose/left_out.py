@@ -63,17 +63,19 @@ def without_image(camera: QueryCamera, matches: Matches, pose: FloatArray) -> Ma
 def _downdated(white: FloatArray, covariance: FloatArray, free: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Steps (n, k), covariances (n, k, k) and which are still determined, without one observation each.
 
+    Steps and covariances of the others are zero.
     ``white`` are whitened records (n, 2, k + 1), ``free`` bases (n, k, m) of what the landmarks can do.
     """
     J, r = white[..., :-1] @ free, white[..., -1]
     weight = 1.0 / (1.0 + (r**2).sum(axis=1) / 9.0) ** 2
     before = np.linalg.inv(np.swapaxes(free, 1, 2) @ covariance @ free)
     values, vectors = np.linalg.eigh(before)
-    root = vectors / np.sqrt(np.maximum(values, 1e-300))[:, None, :]  # of the covariance: inside it, information is one
+    known = values[:, 0] > 0.0  # what is hardly determined may be negative, by rounding
+    root = vectors / np.sqrt(np.where(known[:, None], values, 1.0))[:, None, :]  # inside it, information is one
     inside = J @ root
     left, axes = np.linalg.eigh(np.eye(inside.shape[2]) - np.einsum("n,nki,nkj->nij", weight, inside, inside))
-    good = left[:, 0] > _LEFT
-    root = root @ axes / np.sqrt(np.where(good[:, None], left, 1.0))[:, None, :]
+    good = known & (left[:, 0] > _LEFT)
+    root = good[:, None, None] * (root @ axes / np.sqrt(np.where(good[:, None], left, 1.0))[:, None, :])
     after = root @ np.swapaxes(root, 1, 2)
     step = np.einsum("nij,nkj,n,nk->ni", after, J, weight, r)
     wide = np.broadcast_to(free, (len(J), *free.shape[1:]))
