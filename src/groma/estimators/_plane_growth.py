@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # its parts are imported when something of them is first used
 
 from groma._numba import loop
 from groma._ordering import copy, median
@@ -218,7 +219,7 @@ class Grower:
         if inner == 0 or share < options.min_share:
             return None, plane, rows
         alarm = self._log10_false_alarms(plane, rows)
-        if alarm > np.log10(options.max_false_alarms):
+        if max(alarm, self._log10_even(inner, band)) > np.log10(options.max_false_alarms):
             return None, plane, rows
         precision, weight = self._numbers[2, :inner], self._numbers[3, :inner]
         fit = fit_with_covariance(plane, center, features.places[layer], precision, weight)
@@ -246,6 +247,15 @@ class Grower:
         if inside == 0:
             return self._log_tried
         return log10_poisson_tail(inside - 4, chance) + self._log_tried  # three fix it
+
+    def _log10_even(self, inner: int, band: float) -> float:
+        """How likely so much of the last layer lies on the plane if the layer is filled evenly, base-10 logarithm.
+
+        The sides of a thin post fill the layer of any plane that cuts through them.
+        """
+        height, reach = np.abs(self._numbers[0, :inner]), math.sqrt(self._gate) * self._numbers[1, :inner]
+        on, chance = np.count_nonzero(height < reach), float(np.minimum(reach / band, 1.0).mean())
+        return float(np.log10(max(scipy.special.bdtrc(on - 4, inner - 3, chance), 1e-300)))  # three fix it
 
 
 def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, plane: FloatArray) -> BoolArray:
