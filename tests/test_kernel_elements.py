@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Numbers of arrays in compiled loops: the right ones, whatever the layout, the sign and the kind of the indices."""
+"""Numbers and parts of arrays in compiled loops, whatever the layout, the sign and the kind of the indices; ranges."""
 
 import os
 import subprocess
@@ -43,6 +43,70 @@ def _add_up(values):
     for k in range(1, len(values)):
         total += values[k]
     return total
+
+
+@loop
+def _part(array, index):
+    return array[index]
+
+
+@loop
+def _part_of_three(array, first, second):
+    return array[first, second], array[first][second]
+
+
+@loop
+def _part_of_what_is_gone(size):
+    array = np.empty((size, 3))
+    for i in range(size):
+        array[i] = i
+    return array[size - 1]
+
+
+@loop
+def _sum_of_row(row):
+    total = 0.0
+    for value in row:
+        total += value
+    return total
+
+
+@loop
+def _sums_of_rows(array, out):
+    for i in range(array.shape[0]):
+        out[i] = _sum_of_row(array[i])
+
+
+@loop
+def _counted(start, end, step):
+    visited, last = 0, -1
+    for i in range(start, end, step):
+        visited, last = visited + 1, i
+    return visited, last
+
+
+@loop
+def _counted_by_one(start, end):
+    visited, last = 0, -1
+    for i in range(start, end):
+        visited, last = visited + 1, i
+        i += 5
+    return visited, last
+
+
+@loop
+def _nested(count):
+    total = 0
+    for _ in range(2):
+        numbers = range(count)
+        for i in numbers:
+            if i == 3:
+                continue
+            for j in range(i):
+                if j == 2:
+                    break
+                total += 10 * i + j
+    return total + len(range(count))
 
 
 def _layouts():
@@ -100,3 +164,61 @@ def test_numba_checks_bounds_where_it_is_asked_to():
         env={**os.environ, "NUMBA_BOUNDSCHECK": "1"},
     )
     assert done.stdout.strip() == "refused", done.stderr
+
+
+@pytest.mark.parametrize("layout", _layouts())
+def test_parts_are_views(layout):
+    for i in range(-3, 3):
+        array = _layouts()[layout]
+        found = _part(array, i)
+        np.testing.assert_array_equal(found, array[i])
+        assert found.shape == array[i].shape
+        assert found.strides == array[i].strides
+        found[1] = 1
+        np.testing.assert_array_equal(found, array[i])
+    three = np.asfortranarray(np.arange(24.0).reshape(2, 3, 4))
+    for array in (three, np.ascontiguousarray(three), three[::-1, :, ::2], three.transpose(1, 0, 2)):
+        for found in _part_of_three(array, 1, np.int32(-1)):
+            np.testing.assert_array_equal(found, array[1, -1])
+        np.testing.assert_array_equal(_part(array, np.uint8(1)), array[1])
+
+
+def test_parts_of_what_must_not_be_written():
+    array = np.arange(6.0).reshape(2, 3)
+    array.flags.writeable = False
+    found = _part(array, 1)
+    np.testing.assert_array_equal(found, array[1])
+    assert not found.flags.writeable
+
+
+def test_a_part_keeps_what_it_is_part_of():
+    """And nothing else does: counts of references are as they were."""
+    parts = [_part_of_what_is_gone(50) for _ in range(20)]
+    for found in parts:
+        np.testing.assert_array_equal(found, np.full(3, 49.0))
+    array, out = np.arange(12.0).reshape(4, 3), np.empty(4)
+    before = sys.getrefcount(array)
+    for _ in range(10):
+        _sums_of_rows(array, out)
+    assert sys.getrefcount(array) == before
+    np.testing.assert_array_equal(out, array.sum(axis=1))
+
+
+@pytest.mark.parametrize("kind", [int, np.int32, np.uint64])
+def test_ranges_are_those_of_python(kind):
+    ends = range(5) if kind is np.uint64 else range(-3, 5)
+    for start in ends:
+        for end in ends:
+            expected = list(range(start, end))
+            assert _counted_by_one(kind(start), kind(end)) == (len(expected), expected[-1] if expected else -1)
+            for step in (1, 2, 7) if kind is np.uint64 else (-3, -1, 1, 2, 7):
+                expected = list(range(start, end, step))
+                found = _counted(kind(start), kind(end), kind(step))
+                assert found == (len(expected), expected[-1] if expected else -1)
+    with pytest.raises(ValueError, match="must not be zero"):
+        _counted(kind(0), kind(3), kind(0))
+
+
+def test_ranges_in_ranges():
+    for count in range(7):
+        assert _nested(count) == _nested.py_func(count)

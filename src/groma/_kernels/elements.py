@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Code for reading and writing one number of an array, a fifth as long as Numba's own.
+"""Code for numbers and parts of arrays and for ranges, a fifth to a third as long as Numba's own.
 
 Numba copies an array's description to the stack, unpacks all of it, and leaves it to LLVM to remove most. Kernels are
-full of ``J[0, 3]``, so half of what LLVM parses and optimises, and much of what Python spends on making it, is that.
-Here only the fields that are used are read. The address is computed by the same formula, so the numbers are the same.
+full of ``J[0, 3]`` and ``for i in range(n)``, so half of what LLVM parses and optimises, and much of what Python spends
+on making it, is that. Here only the fields that are used are read, and a range stays in registers. Addresses and counts
+are computed by the same formulas in the same blocks, so the machine code is the same.
 
 In come Numba's statements; out comes ``NativeLowering``, the step of the compiler that turns them into LLVM's code.
-Whatever is not one number of an array by integers goes the way of Numba, and so does all if bounds are to be checked.
+Whatever is not part of an array by integers or a range with step 1 goes the way of Numba, and so do arrays if bounds
+are to be checked.
 """
 
 from __future__ import annotations
@@ -25,14 +27,17 @@ _WORD = llvm.IntType(64)
 _ZERO, _HALF = llvm.Constant(_WORD, 0), llvm.IntType(32)
 #: Places in an array's description (Numba's format).
 _DATA, _SHAPE, _STRIDES = 4, 5, 6
+#: What a loop over a range is made of, and numbers of arrays by fixed indices.
+_PARTS = {"pair_first": 0, "pair_second": 1}
+_COUNTING = ("static_getitem", "call", "getiter", "iternext", *_PARTS)
 
 
 def _kinds(array: Any, index: Any) -> tuple[Any, ...] | None:
-    """Return the types of the integers by which an index names one number of an array; None for any other index."""
+    """Return the types of the integers by which an index names part of an array; None for any other index."""
     if type(array) is not types.Array or not isinstance(array.dtype, types.Number | types.Boolean):
         return None
     kinds = tuple(index.types) if isinstance(index, types.Tuple | types.UniTuple) else (index,)
-    fits = len(kinds) == array.ndim and all(isinstance(kind, types.Integer) for kind in kinds)
+    fits = 0 < len(kinds) <= array.ndim and all(isinstance(kind, types.Integer) for kind in kinds)
     return kinds if fits else None
 
 
@@ -98,17 +103,86 @@ class _Lower(Lower):
         return cgutils.alloca_once(self.builder, lltype, name=name, zfill=False)
 
     def lower_expr(self, resty: Any, expr: Any) -> Any:
-        """Spare arrays the search for code for fixed indices, of which there is none."""
+        """Spare arrays the search for code for fixed indices, of which there is none; count by short code."""
+        if expr.op not in _COUNTING:
+            return super().lower_expr(resty, expr)
+        kind: Any = self.typeof((expr.func if expr.op == "call" else expr.value).name)
         if expr.op == "static_getitem" and expr.index_var is not None:
-            if type(self.typeof(expr.value.name)) is types.Array:
+            if type(kind) is types.Array:
                 return self.lower_getitem(resty, expr, expr.value, expr.index_var, self.fndesc.calltypes[expr])
+        elif expr.op == "call" and isinstance(resty, types.RangeType) and getattr(kind, "typing_key", None) is range:
+            return self._range(expr, resty)
+        elif expr.op == "getiter" and isinstance(kind, types.RangeType):
+            return self._start(self.loadvar(expr.value.name), expr, resty)
+        elif expr.op == "iternext" and isinstance(kind, types.RangeIteratorType):
+            return self._next(self.loadvar(expr.value.name), resty)
+        elif expr.op in _PARTS and isinstance(kind, types.Pair) and not self._is_counted(resty):
+            return self.builder.extract_value(self.loadvar(expr.value.name), _PARTS[expr.op])
         return super().lower_expr(resty, expr)
 
+    def _range(self, expr: Any, kind: Any) -> Any:
+        """Return start, end and step."""
+        signature = self.fndesc.calltypes[expr]
+        given = self.fold_call_args(self.typeof(expr.func.name), signature, expr.args, expr.vararg, expr.kws)
+        word = given[0].type
+        start, end, step = (word(0), *given, word(1)) if len(given) == 1 else (*given, word(1))[:3]
+        return self._filled(self.context.get_value_type(kind), (start, end, step))
+
+    def _start(self, state: Any, expr: Any, kind: Any) -> Any:
+        """Return where a range has come to: a number, how many are left, and the step."""
+        build, (start, end, step) = self.builder, (self._part(state, place) for place in range(3))
+        if not (isinstance(step, llvm.Constant) and step.constant == 1):
+            return super().lower_expr(kind, expr)
+        block = build.append_basic_block()  # as Numba does; without, LLVM orders blocks in another way
+        build.branch(block)
+        build.position_at_end(block)
+        number, left = (cgutils.alloca_once(build, start.type) for _ in range(2))
+        build.store(start, number)
+        length = build.sub(end, start)
+        is_empty = build.xor(build.icmp_signed(">", length, start.type(0)), cgutils.true_bit)
+        with build.if_else(is_empty) as (then, otherwise):
+            with then:
+                build.store(start.type(0), left)
+            with otherwise:
+                build.store(length, left)
+        return self._filled(self.context.get_value_type(kind), (number, end, step, left))
+
+    def _next(self, state: Any, kind: Any) -> Any:
+        """Return the next number, and whether there is one."""
+        build: Any = self.builder
+        number, _, step, left = (self._part(state, place) for place in range(4))
+        count = build.load(left)
+        one = count.type(1)
+        found = cgutils.alloca_once(build, count.type, zfill=True)
+        is_there = build.icmp_signed(">", count, count.type(0))
+        with build.if_then(is_there):
+            value = build.load(number)
+            build.store(value, found)
+            build.store(build.sub(count, one, flags=["nsw"]), left)
+            build.store(build.add(value, step), number)
+        return self._filled(self.context.get_value_type(kind), (build.load(found), is_there))
+
+    def _part(self, value: Any, place: int) -> Any:
+        """Return what is at a place of a tuple."""
+        seen = _item(value, place)
+        return self.builder.extract_value(value, place) if seen is None else seen
+
+    def _filled(self, kind: Any, parts: Any) -> Any:
+        """Return a tuple of given parts."""
+        value = kind(llvm.Undefined)
+        for place, part in enumerate(parts):
+            value = self.builder.insert_value(value, part, place)
+        return value
+
     def lower_getitem(self, resty: Any, expr: Any, value: Any, index: Any, signature: Any) -> Any:
-        """Read one number."""
+        """Read one number, or name a part of an array by its first indices."""
         array = self.typeof(value.name)
-        kinds = self._kinds(array, index)
-        if kinds is None or signature.return_type != array.dtype:
+        kinds, found = self._kinds(array, index), signature.return_type
+        if kinds is not None and type(found) is types.Array and found.ndim == array.ndim - len(kinds):
+            part = self._view(value.name, array, index.name, kinds)
+            self.incref(found, part)
+            return self.context.cast(self.builder, part, found, resty)
+        if kinds is None or found != array.dtype:
             return super().lower_getitem(resty, expr, value, index, signature)
         from numba.np.arrayobj import load_item  # with much else that loaded code does not need
 
@@ -119,7 +193,8 @@ class _Lower(Lower):
         """Write one number."""
         array, kind = self.typeof(target_var.name), self.typeof(value_var.name)
         kinds = self._kinds(array, index_var)
-        if kinds is None or not isinstance(types.unliteral(kind), types.Number | types.Boolean):
+        is_one = kinds is not None and len(kinds) == array.ndim
+        if kinds is None or not is_one or not isinstance(types.unliteral(kind), types.Number | types.Boolean):
             return super().lower_setitem(target_var, index_var, value_var, signature)
         from numba.np.arrayobj import store_item
 
@@ -130,8 +205,22 @@ class _Lower(Lower):
         """As above; None where Numba is asked to check bounds, too."""
         return None if self.context.enable_boundscheck else _kinds(array, self.typeof(index.name))
 
+    def _view(self, name: str, array: Any, index_name: str, kinds: tuple[Any, ...]) -> Any:
+        """Return the description of part of an array."""
+        place, axes = self._place(name, array, index_name, kinds), range(len(kinds), array.ndim)
+        shape, strides = ([self._field(name, field, axis) for axis in axes] for field in (_SHAPE, _STRIDES))
+        build: Any = self.builder
+        count = shape[0]
+        for length in shape[1:]:
+            count = build.mul(count, length, flags=["nsw"])
+        lengths = llvm.ArrayType(_WORD, len(axes))
+        owner, parent, size = (self._field(name, field) for field in (0, 1, 3))
+        packed = self._filled(lengths, shape), self._filled(lengths, strides)
+        kind = self.context.get_value_type(array.copy(ndim=len(axes)))
+        return self._filled(kind, (owner, parent, count, size, place, *packed))
+
     def _place(self, name: str, array: Any, index_name: str, kinds: tuple[Any, ...]) -> Any:
-        """Return the address of a number."""
+        """Return the address of a number, the first one if indices are missing."""
         build, index = self.builder, self.loadvar(index_name)
         is_one = not isinstance(self.typeof(index_name), types.BaseTuple)
         indices = []
@@ -140,13 +229,12 @@ class _Lower(Lower):
             given = build.extract_value(index, axis) if given is None else given
             indices.append(self._from_start(given, kind, name, axis))
         if array.layout == "A":
-            steps = [self._field(name, _STRIDES, axis) for axis in range(array.ndim)]
+            steps = [self._field(name, _STRIDES, axis) for axis in range(len(kinds))]
             data = build.bitcast(self._field(name, _DATA), llvm.IntType(8).as_pointer())
             place = build.gep(data, [self._sum(indices, steps)])
             return build.bitcast(place, self.context.get_data_type(array.dtype).as_pointer())
-        axes = range(array.ndim)
-        steps = []
-        for axis in axes:
+        axes, steps = range(array.ndim), []
+        for axis in axes[: len(kinds)]:
             step = None
             for other in axes[axis + 1 :] if array.layout == "C" else axes[:axis]:
                 length = self._field(name, _SHAPE, other)

@@ -116,10 +116,6 @@ class _InnerLibrary(_Library):
 class _Steps(PassManager):
     """Numba's steps of compiling, without the events, descriptions and clocks around each, a twentieth of the time."""
 
-    def run(self, state: Any) -> None:
-        with on_demand(), remembering(), _linking_overloads():
-            super().run(state)
-
     def _runPass(self, index: int, pss: Any, internal_state: Any) -> None:  # type: ignore[override]  # noqa: N802
         pss.analysis = self._analysis
         for run in (pss.run_initialization, pss.run_pass, pss.run_finalizer):
@@ -136,7 +132,7 @@ class Pipeline(Compiler):
             state.library = kind(state.targetctx.codegen(), state.func_id.func_qualname)
             state.library.enable_object_caching()
             if kind is _InnerLibrary:
-                state.flags.no_compile = state.flags.no_cpython_wrapper = True
+                state.flags.no_compile = state.flags.no_cpython_wrapper = state.flags.no_cfunc_wrapper = True
         pipelines = super().define_pipelines()
         return [_ours(pipeline) for pipeline in pipelines]
 
@@ -201,9 +197,12 @@ def tell_apart(dispatcher: Any) -> None:
         with global_compiler_lock:
             arguments = tuple(normalize_signature(signature)[0])
             found = dispatcher.overloads.get(arguments)
-            if not _depth and found is not None and isinstance(found.entry_point, _NoMachineCode):
+            if _depth:
+                return kind.compile(dispatcher, signature)
+            if found is not None and isinstance(found.entry_point, _NoMachineCode):
                 del dispatcher.overloads[arguments]
-            return kind.compile(dispatcher, signature)
+            with on_demand(), remembering(), _linking_overloads():
+                return kind.compile(dispatcher, signature)
 
     def add_overload(result: Any) -> None:
         if isinstance(result.entry_point, _NoMachineCode):

@@ -22,6 +22,7 @@ from typing import Any
 import llvmlite.binding as llvm
 from numba.core import event, types
 from numba.core.compiler_machinery import register_pass
+from numba.core.runtime.context import NRTContext
 from numba.core.typed_passes import NopythonTypeInference
 from numba.core.types.functions import BaseFunction
 
@@ -35,7 +36,7 @@ _KNOWN = frozenset(
 _meanings: dict[Any, tuple[Any, Any]] = {}
 #: What Numba calls the events around each call of LLVM.
 _LLVM_CALLS = "numba:llvm_lock"
-_call_type = BaseFunction.get_call_type
+_call_type, _find_counts = BaseFunction.get_call_type, NRTContext.get_meminfos
 
 
 def _is_simple(kind: Any) -> bool:
@@ -112,15 +113,25 @@ def _remembered_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
     return _meanings[key][1]
 
 
+def _counts(self: Any, builder: Any, ty: Any, val: Any) -> list[Any]:
+    """Take the place of :meth:`NRTContext.get_meminfos`: where references to arrays are counted.
+
+    Numba takes the whole description of an array apart to find the first field.
+    """
+    if type(ty) is types.Array:
+        return [(ty, builder.extract_value(val, 0))]
+    return _find_counts(self, builder, ty, val)
+
+
 @contextmanager
 def remembering() -> Iterator[None]:
     """Let Numba look for the meaning of operators once; for a thread that holds the lock of the compiler."""
     lock: Any = llvm.ffi.lib._lock
-    before = BaseFunction.get_call_type, lock._cblist
-    BaseFunction.get_call_type = _remembered_call_type
+    before = BaseFunction.get_call_type, NRTContext.get_meminfos, lock._cblist
+    BaseFunction.get_call_type, NRTContext.get_meminfos = _remembered_call_type, _counts
     if not event._registered.get(_LLVM_CALLS):
         lock._cblist = []
     try:
         yield
     finally:
-        BaseFunction.get_call_type, lock._cblist = before
+        BaseFunction.get_call_type, NRTContext.get_meminfos, lock._cblist = before
