@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -188,8 +189,9 @@ def spread(
 def corners(image: GrayImage, count: int, distance: float) -> FloatArray:
     """Corners (Shi and Tomasi) that noise does not explain, (N, 2) pixels, strongest first."""
     gates = POINT_TRACKS
+    everywhere: Any = None  # OpenCV's types do not say so
     found, strength = cv2.goodFeaturesToTrackWithQuality(
-        image, count, gates.quality, distance, None, blockSize=gates.block
+        image, count, gates.quality, distance, everywhere, blockSize=gates.block
     )
     if found is None:
         return np.zeros((0, 2))
