@@ -9,7 +9,7 @@ from _wireframe import arc, random_lines, wireframe
 from scipy.special import logit
 
 from groma.mapping.lines.filtering.filters import FilterGates
-from groma.mapping.lines.filtering.texture import TextureGates, edge_odds, num_expected
+from groma.mapping.lines.filtering.texture import TextureGates, _cost, _minimum, edge_odds, num_expected
 from groma.mapping.lines.linking.tracks import Tracks
 from groma.mapping.lines.views import build_views
 
@@ -94,3 +94,31 @@ def test_images_that_should_show_a_line(size):
         most[n] = max(most[n], (np.array(shown) >= 29.5).sum())
     assert ((least <= counted) & (counted <= most)).all()
     assert (counted[np.unique(tracks.line_of[tracks.line_of >= 0])] > 0).all()
+
+
+def test_the_derivatives_of_the_cost_are_those_of_differences():
+    """Central differences over 1e-4 are wrong by 1e-8 of third derivatives, which the 80 rows leave below 100."""
+    rng = np.random.default_rng(5)
+    lines, leftover = (np.column_stack([np.ones(count), rng.normal(size=(count, 2))]) for count in (30, 50))
+    given = lines, rng.normal(0.0, 2.0, 30), leftover, np.array([10.0, 1.5, 1.5]), np.array([-2.5, -0.5])
+    at, step = rng.normal(size=5), 1e-4
+    _, slope, bend = _cost(*given, at)
+    around = [(_cost(*given, at + step * one), _cost(*given, at - step * one)) for one in np.eye(5)]
+    np.testing.assert_allclose(slope, [(plus[0] - minus[0]) / (2.0 * step) for plus, minus in around], atol=1e-6)
+    np.testing.assert_allclose(bend, [(plus[1] - minus[1]) / (2.0 * step) for plus, minus in around], atol=1e-6)
+
+
+@pytest.mark.parametrize("start", [(-1.2, 1.0), (0.0, 3.0), (1.0, 1.0)])
+def test_newton_finds_the_minimum_also_where_the_cost_bends_down(start):
+    """Rosenbrock's valley; above it, at (0, 3), one curvature is negative."""
+
+    def valley(p):
+        (x, y), rise = p, p[1] - p[0] ** 2
+        slope = np.array([-400.0 * x * rise - 2.0 * (1.0 - x), 200.0 * rise])
+        return (
+            (1.0 - x) ** 2 + 100.0 * rise**2,
+            slope,
+            np.array([[1200.0 * x**2 - 400.0 * y + 2.0, -400.0 * x], [-400.0 * x, 200.0]]),
+        )
+
+    np.testing.assert_allclose(_minimum(valley, np.array(start)), 1.0, atol=1e-5)

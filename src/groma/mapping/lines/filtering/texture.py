@@ -121,7 +121,7 @@ def edge_odds(
     min_images : int
         Lines of fewer images were dropped.
     """
-    expit, log_expit = scipy.special.expit, scipy.special.log_expit
+    log_expit = scipy.special.log_expit
     member = line_of >= 0
     features = features_of(eligible | member, *kinds)
     leftover = features[eligible & ~member]
@@ -130,32 +130,40 @@ def edge_odds(
     lines = np.column_stack(sums) / number[:, None]
     ratio = _log_chance(seen, expected, min_images, GATES.edge)
     ratio -= _log_chance(seen, expected, min_images, GATES.texture)
-
-    prior_odds, odds_sigma = np.log([share / (1.0 - share) for share in GATES.line_shares]), GATES.share_sigma
     spread = np.array([GATES.weight_sigma[0]] + [GATES.weight_sigma[1]] * len(kinds))
-
-    def cost(p: FloatArray) -> Cost:
-        weights, odds = p[:-2], p[-2:]
-        value = 0.5 * float((weights**2 / spread**2).sum() + ((odds - prior_odds) ** 2).sum() / odds_sigma**2)
-        slope = np.concatenate([weights / spread**2, (odds - prior_odds) / odds_sigma**2])
-        bend = np.diag(np.concatenate([spread**-2.0, np.full(2, odds_sigma**-2.0)]))
-        for features, gain, sign in ((lines, ratio, 1.0), (leftover, 0.0, -1.0)):
-            z = features @ weights
-            texture, edge = log_expit(-z) + log_expit(sign * odds[0]), log_expit(z) + log_expit(sign * odds[1]) + gain
-            value -= float(np.logaddexp(texture, edge).sum())
-            is_edge, before, share = expit(edge - texture), expit(z), sign * expit(-sign * odds)
-            open_, number = is_edge * (1.0 - is_edge), np.array([(1.0 - is_edge).sum(), is_edge.sum()])
-            slope[:-2] -= features.T @ (is_edge - before)
-            slope[-2:] -= share * number
-            turn = share * [-1.0, 1.0]  # how the odds of an edge change with those of both shares
-            bend[:-2, :-2] -= (features * (open_ - before * (1.0 - before))[:, None]).T @ features
-            bend[:-2, -2:] -= np.outer(features.T @ open_, turn)
-            bend[-2:, -2:] -= open_.sum() * np.outer(turn, turn) - np.diag(number * expit(odds) * expit(-odds))
-        bend[-2:, :-2] = bend[:-2, -2:].T
-        return value, slope, bend
-
-    p = _minimum(cost, np.concatenate([1.0 / spread, prior_odds]))
+    usual = np.log([share / (1.0 - share) for share in GATES.line_shares])
+    p = _minimum(partial(_cost, lines, ratio, leftover, spread, usual), np.concatenate([1.0 / spread, usual]))
     return lines @ p[:-2] + ratio + log_expit(p[-1]) - log_expit(p[-2])
+
+
+def _cost(
+    lines: FloatArray, ratio: FloatArray, leftover: FloatArray, spread: FloatArray, usual: FloatArray, p: FloatArray
+) -> Cost:
+    """Return what is least at the maximum a posteriori estimate of weights and log odds of shares, ``p``.
+
+    Features are those of lines, with the logarithm of how much likelier the images are of edges, and those of leftover
+    segments. Priors have zero weights with deviations ``spread``, and the ``usual`` odds.
+    """
+    expit, log_expit = scipy.special.expit, scipy.special.log_expit
+    weights, odds = p[:-2], p[-2:]
+    middle = np.concatenate([np.zeros(len(weights)), usual])
+    precision = np.concatenate([spread**-2.0, np.full(2, GATES.share_sigma**-2.0)])
+    slope, bend = precision * (p - middle), np.diag(precision)
+    value = 0.5 * float(slope @ (p - middle))
+    for features, gain, sign in ((lines, ratio, 1.0), (leftover, 0.0, -1.0)):
+        z = features @ weights
+        texture, edge = log_expit(-z) + log_expit(sign * odds[0]), log_expit(z) + log_expit(sign * odds[1]) + gain
+        value -= float(np.logaddexp(texture, edge).sum())
+        is_edge, before, share = expit(edge - texture), expit(z), sign * expit(-sign * odds)
+        unsure, number = is_edge * (1.0 - is_edge), np.array([(1.0 - is_edge).sum(), is_edge.sum()])
+        slope[:-2] -= features.T @ (is_edge - before)
+        slope[-2:] -= share * number
+        turn = share * [-1.0, 1.0]  # how the log odds of an edge change with those of both shares
+        bend[:-2, :-2] -= (features * (unsure - before * (1.0 - before))[:, None]).T @ features
+        bend[:-2, -2:] -= np.outer(features.T @ unsure, turn)
+        bend[-2:, -2:] -= unsure.sum() * np.outer(turn, turn) - np.diag(number * expit(odds) * expit(-odds))
+    bend[-2:, :-2] = bend[:-2, -2:].T
+    return value, slope, bend
 
 
 def _minimum(cost: Callable[[FloatArray], Cost], at: FloatArray) -> FloatArray:
