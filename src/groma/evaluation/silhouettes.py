@@ -68,7 +68,9 @@ def evaluate_silhouettes(scene: Scene, masks: Mapping[str, npt.NDArray[np.bool_]
     views = [(image, masks[name]) for image, name in enumerate(scene.images.names) if name in masks]
     views = [(image, mask) for image, mask in views if mask.any()]
     if not views:
-        raise InputError("No image of the scene has a silhouette. Name the masks like the images; the object is not black.")
+        raise InputError(
+            "No image of the scene has a silhouette. Name the masks like the images; the object is not black."
+        )
     distance, poses = np.zeros(len(places)), scene.cam_from_world
     for image, mask in views:
         camera = scene.images.camera_idx[image]
