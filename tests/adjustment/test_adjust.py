@@ -182,3 +182,13 @@ def test_a_focal_length_of_zero_is_refused_without_warnings():
     with warnings.catch_warnings(), pytest.raises(ProblemError, match="positive focal lengths"):
         warnings.simplefilter("error")
         adjust(scene.replace(cameras=dataclasses.replace(scene.cameras, params=params)))
+
+
+@pytest.mark.parametrize("loss", ["auto", "none"])
+def test_without_a_step_nothing_moves(loss):
+    """Lines that fit badly are started again between two stages, but not where the start alone is evaluated."""
+    start = holistic(8, noise_px=0.5, seed=1).start
+    result = adjust(start, AdjustOptions(loss=loss, max_iterations=0, check_lens=False))
+    assert result.report.solve.final_cost == result.report.solve.initial_cost
+    np.testing.assert_allclose(result.scene.lines.plucker, start.lines.plucker, atol=1e-12)
+    np.testing.assert_array_equal(result.scene.points.xyz, start.points.xyz)

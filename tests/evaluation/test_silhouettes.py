@@ -43,6 +43,13 @@ def test_distances_from_the_silhouette(scene):
         evaluate_silhouettes(scene, {"c.png": mask(10)})
 
 
+def test_a_mask_without_the_object_tells_nothing(scene):
+    both = evaluate_silhouettes(scene, {"a.png": mask(90), "b.png": mask(0)})
+    assert both.num_views == 1 and both.distance[1] == pytest.approx(10.0)
+    with pytest.raises(InputError, match="No image of the scene has a silhouette"):
+        evaluate_silhouettes(scene, {"b.png": mask(0)})
+
+
 def test_gaps_and_what_lies_behind_the_camera_do_not_count(scene):
     gap = scene.replace(line_intervals=LineIntervals([1, 1], [0.0, 0.5], [0.2, 0.8]))
     assert evaluate_silhouettes(gap, {"a.png": mask(90)}).distance[1] == 0.0

@@ -244,7 +244,7 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
         reports.append(solution.report)
         if stopped:
             break
-        for renew in () if last else (renew_lines, settle_clusters):
+        for renew in () if last or not options.max_iterations else (renew_lines, settle_clusters):
             problem, renewed = with_held_states(problem, *renew(scene, problem, options.threads))
             moved.append(renewed)
         if not isinstance(loss, Trivial) and solution.report.iterations:

@@ -56,7 +56,7 @@ def evaluate_silhouettes(scene: Scene, masks: Mapping[str, npt.NDArray[np.bool_]
         Lines, and the cameras of the views.
     masks : mapping of str to (H, W) bool
         Where the object is, by name of the image. Places outside of a mask's frame, and behind the camera, do not
-        count.
+        count, nor do masks without the object, from which there is no distance.
 
     Raises
     ------
@@ -66,8 +66,11 @@ def evaluate_silhouettes(scene: Scene, masks: Mapping[str, npt.NDArray[np.bool_]
     pieces, line = line_pieces(scene)
     places, owner = places_on(pieces, np.full(len(pieces), _PLACES))
     views = [(image, masks[name]) for image, name in enumerate(scene.images.names) if name in masks]
+    views = [(image, mask) for image, mask in views if mask.any()]
     if not views:
-        raise InputError("No image of the scene has a silhouette. Name the masks like the images.")
+        raise InputError(
+            "No image of the scene has a silhouette. Name the masks like the images; the object is not black."
+        )
     distance, poses = np.zeros(len(places)), scene.cam_from_world
     for image, mask in views:
         camera = scene.images.camera_idx[image]

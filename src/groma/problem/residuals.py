@@ -93,4 +93,4 @@ def squared_norms(factor: Factor, variables: Mapping[str, Variables]) -> FloatAr
     return np.einsum("ni,ni->n", residuals, residuals) * information**2
 
 
-__all__ = ["Residuals", "jacobians_of", "residuals_of", "root_matrices", "squared_norms"]
+__all__ = ["Residuals", "jacobians_of", "residuals_of", "squared_norms"]

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from groma._counted import counted
 from groma._typing import IntArray
 from groma.adjustment.assemble import (
     Assembly,
@@ -39,7 +40,7 @@ from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.scene import Scene, Similarity
 from groma.scene.local_frame import local_frame
-from groma.scene.survey import accepted
+from groma.scene.survey import Kind, accepted
 from groma.solver.reduce import exact_sums
 from groma.solver.reduce.contract import Reducer
 from groma.solver.reduce.shard import Shard
@@ -150,6 +151,7 @@ def open_parts(paths: Sequence[Path], options: AssemblyOptions, reducer: Reducer
     _check_same(reducer, [[path.name, size] for path, size in zip(paths, sizes, strict=True)])
     with agreed(reducer):
         head = read_archive(paths[0])
+        _check_distances(paths[0], head)
         near = local_frame(head)
         head = head if near is None else head.transformed(near)
     mine = np.flatnonzero(_owners(sizes, reducer.size) == reducer.rank)
@@ -195,6 +197,17 @@ def _read_own(
         facts[number] = _facts(accepted(scene), options, made)
         count += observations_of_frames(scene)
     return parts, held | {name: _joined(group) for name, group in groups.items()}, facts, count
+
+
+def _check_distances(path: Path, head: Scene) -> None:
+    """Refuse distances that tie two landmarks, all of which are eliminated in their part."""
+    table, landmarks = head.distances, (Kind.CONTROL_POINT, Kind.LINE)
+    tied = np.isin(table.first_kind, landmarks) & np.isin(table.second_kind, landmarks) & ~table.rejected
+    if tied.any():
+        raise InputError(
+            f"{path} has {counted(int(tied.sum()), 'distances')} between control points or lines, which are not "
+            "adjusted in parts. Adjust the scene as a whole, or leave these distances out."
+        )
 
 
 def _sum_of(count: IntArray, reducer: Reducer) -> IntArray:
