@@ -188,9 +188,8 @@ def spread(
 def corners(image: GrayImage, count: int, distance: float) -> FloatArray:
     """Corners (Shi and Tomasi) that noise does not explain, (N, 2) pixels, strongest first."""
     gates = POINT_TRACKS
-    found, strength = cv2.goodFeaturesToTrackWithQuality(
-        image, count, gates.quality, distance, None, blockSize=gates.block
-    )
+    settings: dict = {"mask": None, "blockSize": gates.block}
+    found, strength = cv2.goodFeaturesToTrackWithQuality(image, count, gates.quality, distance, **settings)
     if found is None:
         return np.zeros((0, 2))
     at, strength = found.reshape(-1, 2), strength.ravel()
