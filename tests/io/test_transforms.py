@@ -202,6 +202,11 @@ def test_a_format_of_the_house(true, tmp_path):
     with pytest.raises(OutputError, match=r"out\.points\.ply exists already"):
         write_scene(scene, tmp_path / "out.json")
     assert not (tmp_path / "out.json").exists()
+    (tmp_path / "out.points.ply").rename(tmp_path / "other.points.ply")
+    (tmp_path / "out.json").write_text("of somebody")
+    with pytest.raises(OutputError, match=r"out\.json exists already"):
+        write_scene(scene, tmp_path / "out.json")
+    assert not (tmp_path / "out.points.ply").exists()
 
 
 def test_cameras_that_the_file_does_not_know_are_refused_before_the_work(true, tmp_path):

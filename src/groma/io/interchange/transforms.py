@@ -252,9 +252,10 @@ def write_transforms(
     document = {**(cameras[used[0]] if one else {}), **(others or {}), "frames": frames}
     if scene.num_points:
         document["ply_file_path"] = f"{place.stem}.points.ply"
-        write_ply(scene, place.with_name(document["ply_file_path"]), force, parts=("points",))
     with atomic_output(place, force) as draft:
         draft.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        if scene.num_points:  # within: neither is there without the other
+            write_ply(scene, place.with_name(document["ply_file_path"]), force, parts=("points",))
 
 
 def check_transforms(scene: Scene) -> None:
