@@ -12,6 +12,7 @@ from groma.adjustment.fit import inliers, noise_of
 from groma.adjustment.uncertainty import position_sigma, uncertainty
 from groma.cameras import model
 from groma.cli.app import app
+from groma.cli.shared.sentences import describe_pose_uncertainty
 from groma.geometry import se3
 from groma.io import write_scene
 from groma.scene.synthetic import corridor
@@ -84,8 +85,27 @@ def test_cameras_are_known_as_well_as_they_come_out():
         assert told[-1]["center"]["median"] == pytest.approx(np.median(position_sigma(full.centers)), rel=1e-6)
     predicted = np.mean([numbers["center"]["median"] for numbers in told])
     assert 0.5 < np.mean(errors) / predicted < 2.0
+    assert told[-1]["calibration"] == "all"
+    assert describe_pose_uncertainty(told[-1])[0].endswith("; the calibration counts as exact")
+    lens = groma.adjust(noisy, groma.AdjustOptions(loss="none", refine_intrinsics=True)).pose_uncertainty()
+    assert lens is not None and lens["calibration"] == "part"  # principal points are held
+    assert "what is held of the calibration" in describe_pose_uncertainty(lens)[0]
     held = groma.adjust(truth, groma.AdjustOptions(refine_poses=False))
     assert held.pose_uncertainty() is None
+
+
+def test_cameras_that_are_not_determined_are_told():
+    """Two halves that share no point: nothing says where one is as seen from the other."""
+    scene = exactly_seen(corridor(10, seed=1).truth.points_only())
+    table = scene.point_observations
+    halves = (table.image_idx < 5) == (table.point_idx % 2 == 0)
+    result = groma.adjust(scene.replace(point_observations=table.take(halves)), groma.AdjustOptions(loss="none"))
+    numbers = result.pose_uncertainty()
+    assert numbers is not None and numbers["center"] == {"median": None, "largest": None, "undetermined": 10}
+    assert "rank deficient" in numbers["why_not"]
+    told = describe_pose_uncertainty(numbers)
+    assert told == [f"Cameras: how well they are known cannot be told. {numbers['why_not']}"]
+    assert describe_pose_uncertainty(None) == []
 
 
 def test_what_did_not_converge_says_so(tmp_path):

@@ -150,6 +150,18 @@ def test_damage_is_named(true, tmp_path, change, words):
         read_scene(write(tmp_path, document))
 
 
+@pytest.mark.parametrize(
+    ("change", "remedy"),
+    [(np.transpose, "Transpose them"), (lambda matrix: matrix / 844.4, "Divide each by its last number")],
+)
+def test_matrices_of_other_forms_are_named_with_what_to_do(true, tmp_path, change, remedy):
+    listed = frames(true)
+    for frame in listed:
+        frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
+    with pytest.raises(FileFormatError, match=f"last row is 0 0 0 1. {remedy}"):
+        read_scene(write(tmp_path, {**LENS, "frames": listed}))
+
+
 def test_left_handed_axes_are_named(true, tmp_path):
     listed = frames(true)
     for frame in listed:

@@ -172,8 +172,9 @@ def pose_uncertainty(
     """Return how well the cameras alone are known: ``gauge``, ``sigma0``, ``center`` and ``rotation_deg``.
 
     The entries are those of :meth:`SceneUncertainty.to_dict`; for the parameters see :func:`uncertainty`. None where
-    all cameras are held, or are not determined. ``by_landmarks`` multiplies the deviations, in place of by ``sigma0``,
-    by what leaving out one landmark after the other tells
+    all cameras are held. Where the covariances cannot be computed the entry ``why_not`` says the reason, and there are
+    no deviations. ``calibration`` says how much of it counts as exact: ``all``, ``part`` or ``none``. ``by_landmarks``
+    multiplies the deviations, in place of by ``sigma0``, by what leaving out one landmark after the other tells
     (:mod:`groma.adjustment.misfit.jackknife`); the entry ``factor`` is the median of that. Not where other instruments
     measured the frame: landmarks do not tell how well they did.
     """
@@ -188,14 +189,24 @@ def pose_uncertainty(
         gauge, covariances = _covariances(scene, AssemblyOptions(), gauge, problem)
         poses = covariances.of_coordinates("frames") * (1.0 if by_landmarks else sigma0**2)
         factors = _landmark_factors(scene, covariances.problem, gauge) if by_landmarks else None
-    except ProblemError:
-        return None
+    except ProblemError as error:
+        none = _summary(np.full(_free_cameras(problem), np.nan))
+        return {"gauge": None, "sigma0": sigma0, "center": none, "rotation_deg": none, "why_not": str(error)}
     center, turn = position_sigma(poses[:, :3, :3]), position_sigma(poses[:, 3:, 3:])
-    found: dict[str, Any] = {"gauge": gauge, "sigma0": sigma0}
+    found: dict[str, Any] = {"gauge": gauge, "sigma0": sigma0, "calibration": _exact_calibration(problem)}
     if factors is not None:
         center, turn = center * factors[:, 0], turn * factors[:, 1]
         found["factor"] = float(np.median(factors))
     return {**found, "center": _summary(center), "rotation_deg": _summary(np.rad2deg(turn))}
+
+
+def _exact_calibration(problem: Problem) -> str:
+    """How much of the calibration is held, so that its errors are in no deviation: ``all``, ``part`` or ``none``."""
+    groups = [group for group in problem.variables.values() if group.manifold.kind == "intrinsics"]
+    free = [np.ones(1, bool) if (part := group.free_coordinates()) is None else part for group in groups]
+    if not any(part.any() for part in free):
+        return "all"
+    return "none" if all(part.all() for part in free) else "part"
 
 
 def _landmark_factors(scene: Scene, problem: Problem, gauge: str) -> FloatArray:

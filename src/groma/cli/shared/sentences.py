@@ -30,6 +30,12 @@ _GAUGES = {
     "held": "the first camera and the scale",
     "measured": "the measurements",
 }
+#: Of how much of the calibration the deviations know nothing.
+_EXACT = {
+    "all": "; the calibration counts as exact",
+    "part": "; what is held of the calibration counts as exact",
+    "none": "",
+}
 #: Times in reports that are not of one stage.
 _NO_STAGES = ("total", "compilation")
 
@@ -95,13 +101,16 @@ def fit_table(counts: Mapping[str, int], found: Mapping[str, Mapping[str, Any]])
 
 def describe_pose_uncertainty(numbers: Mapping[str, Any] | None) -> list[str]:
     """Return how well the cameras are known; ``numbers`` is ``pose_uncertainty`` of a report."""
-    if numbers is None or numbers["center"]["median"] is None:
+    if numbers is None:
         return []
+    if numbers["center"]["median"] is None:
+        why = numbers.get("why_not") or "The data determine none of them."
+        return [f"Cameras: how well they are known cannot be told. {why}"]
     center, turn = numbers["center"], numbers["rotation_deg"]
     return [
         f"Cameras: centres known to {center['median']:.2g} (largest {center['largest']:.2g}), rotations to "
         f"{turn['median']:.2g}° (largest {turn['largest']:.2g}°): standard deviations relative to "
-        f"{_GAUGES[numbers['gauge']]}"
+        f"{_GAUGES[numbers['gauge']]}{_EXACT[numbers['calibration']]}"
     ]
 
 

@@ -111,7 +111,9 @@ def read_transforms(path: str | os.PathLike[str]) -> Transforms:
         calibrations, camera_idx = shared(_calibrations(document, frames, names, place))
         matrices = table([frame.get("transform_matrix") for frame in frames], (4, 4), f"{place}, transform_matrix")
         if len(matrices) and np.abs(matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
-            raise FileFormatError(f"{place}: expected matrices whose last row is 0 0 0 1. Transpose them.")
+            turned = np.abs(matrices[:, :, 3] - [0.0, 0.0, 0.0, 1.0]).max() <= 1e-6
+            remedy = "Transpose them." if turned else "Divide each by its last number, or leave out what scaled it."
+            raise FileFormatError(f"{place}: expected matrices whose last row is 0 0 0 1. {remedy}")
         scene = Scene.from_images(
             camera_table(calibrations, place),
             names,
