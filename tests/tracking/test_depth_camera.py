@@ -48,6 +48,7 @@ def test_right_depths_stay(frames):
     assert abs(found["inverse_offset"]) < 3 * found["sigma"]
     assert abs(found["inverse_offset"]) < 0.002
     assert found["sigma"] < 0.002
+    assert not any("disagree" in sentence for sentence in result.warnings)
 
 
 def test_an_offset_beyond_all_noise_is_told_and_not_used(frames):
@@ -55,6 +56,7 @@ def test_an_offset_beyond_all_noise_is_told_and_not_used(frames):
     found = result.statistics["depth_camera"]
     assert found["inverse_offset"] > 0.009
     assert not found["used"]
+    assert sum("Depths and images disagree" in sentence for sentence in result.warnings) == 1
 
 
 def test_correcting_depths_moves_planes_like_points(frames):

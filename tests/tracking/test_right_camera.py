@@ -15,6 +15,7 @@ import pytest
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import RightTurnPrior
 from groma.adjustment.terms.right_columns import RIGHT_CAMERAS
+from groma.errors import InputError
 from groma.geometry import quaternion, se3, so3
 from groma.problem.residuals import residuals_of
 from groma.tracking import Tracker
@@ -24,6 +25,7 @@ from groma.tracking.frame.features import Features
 from groma.tracking.frame.measurements import Measurements, PointMeasurements
 from groma.tracking.frame.rectification import (
     RightTurn,
+    are_exchanged,
     find_pairs,
     fit_rows,
     retargeted,
@@ -119,6 +121,24 @@ def test_a_pair_of_images_is_put_into_rows(turn):
     here, found = find_pairs(CAMERA, left, aligned)
     assert np.abs(np.median((found - here)[:, 1])) < 0.03
     assert np.percentile(np.abs(found - here)[:, 1], 80) < 0.15
+
+
+@pytest.mark.parametrize("shift", [-12, 0, 12, 40])
+def test_exchanged_images_are_told(shift):
+    """Of a wall; a shift within what the right camera may be turned (6 px) tells nothing."""
+    wall = cv2.GaussianBlur(120 + 200 * np.random.default_rng(2).normal(size=(370, 1300)), (0, 0), 2.0)
+    wall = np.clip(wall, 0, 255).astype(np.uint8)
+    left, right = (np.ascontiguousarray(wall[:, begin : begin + 1220]) for begin in (20, 20 + shift))
+    assert are_exchanged(CAMERA, left, right) == (shift < 0)
+    assert are_exchanged(CAMERA, right, left) == (shift > 0)
+    assert not are_exchanged(CAMERA, left, np.full_like(left, 90))
+
+
+def test_a_track_of_exchanged_images_ends_at_once():
+    frames = [replace(one, gray=one.right, right=one.gray) for one in _room.frames("stereo", _room.poses(2))]
+    tracker = Tracker(_room.camera(_room.BASELINE))
+    with pytest.raises(InputError, match="seem to be exchanged"):
+        tracker.process(*frames)
 
 
 # ------------------------------------------------------------------------------------------------------------- maps

@@ -126,6 +126,8 @@ class Ending:
         report, turn = self.attempt(
             "the adjustment of all keyframes", lambda: mapper.adjust_at_end(number), (None, turn), changes=(number,)
         )
+        if mapper.depth_offset is not None:
+            self.warnings += [one for one in mapper.depth_offset.warnings() if one not in self.warnings]
         what = "the planes of the map's points and lines"
         again, planes = self.attempt(what, lambda: mapper.adjust_with_planes(number), (None, None), (number,))
         report = again or report

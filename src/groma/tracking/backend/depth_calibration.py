@@ -52,6 +52,16 @@ class DepthOffset:
         """Return it as plain values."""
         return {"inverse_offset": self.offset, "sigma": self.sigma, "used": self.used}
 
+    def warnings(self) -> list[str]:
+        """Say so where depths and images do not agree."""
+        if self.used:
+            return []
+        return [
+            f"Depths and images disagree: inverse depths would have to be off by {self.offset:+.4f} ± {self.sigma:.4f} "
+            "per metre, more than those of depth cameras are; they were left as they are. Check the focal length, and "
+            "that depths belong to the pixels of the images."
+        ]
+
 
 def estimate_depth_offset(track_map: TrackMap, camera: TrackCamera, options: TrackOptions) -> DepthOffset | None:
     """Return by how much the inverse depths of a map are off; None where there are none to tell.

@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 
 from groma._typing import FloatArray
+from groma.errors import InputError
 from groma.features.images import GrayImage
 from groma.features.point_tracks import follow
 from groma.geometry import so3
@@ -91,9 +92,20 @@ class RightCamera:
         self._looks = gates.looks if turn is None else 0
 
     def rows_aligned(self, left: GrayImage, right: GrayImage) -> GrayImage:
-        """Return a right image with the rows of the left one; the first pairs tell pitch and roll."""
+        """Return a right image with the rows of the left one; the first pairs tell pitch and roll.
+
+        Raises
+        ------
+        InputError
+            If the first pairs seem to be exchanged.
+        """
         if self._looks > 0:
             self._looks -= 1
+            if are_exchanged(self._camera, left, right, self._gates, self._features):
+                raise InputError(
+                    "Expected a left and a right image; most points lie farther right in the second one, so that they "
+                    "seem to be exchanged. Exchange them."
+                )
             here, there = find_pairs(self._camera, left, right, self._gates, self._features)
             angles, information = fit_rows(self._camera, here, there, self._gates)
             if information.any():
@@ -170,6 +182,37 @@ def find_pairs(
     features: FeatureGates = DEFAULT.features,
 ) -> tuple[FloatArray, FloatArray]:
     """Points (N, 2) of the left image and where they are in the right one, pixels, in a wide band about their rows."""
+    here, guess = _alike(camera, left, right, -_band(camera, gates), gates, features)
+    if not len(here):
+        return here, guess
+    there, good = follow(left, right, here, guess, levels=0, round_trip=None)
+    good &= np.linalg.norm(there - guess, axis=1) < gates.max_shift
+    return here[good], there[good]
+
+
+def are_exchanged(
+    camera: TrackCamera,
+    left: GrayImage,
+    right: GrayImage,
+    gates: RectificationGates = DEFAULT.rectification,
+    features: FeatureGates = DEFAULT.features,
+) -> bool:
+    """Whether most points lie farther right in the right image, by more than a turn of that camera explains."""
+    here, there = _alike(camera, left, right, -gates.max_disparity * camera.width, gates, features)
+    behind = int((here[:, 0] - there[:, 0] < -_band(camera, gates)).sum())
+    return len(here) >= gates.min_pairs and 2 * behind > len(here)
+
+
+def _band(camera: TrackCamera, gates: RectificationGates) -> float:
+    """Pixels by which a right camera may be turned."""
+    return float(camera.fx * np.radians(gates.band_deg))
+
+
+def _alike(
+    camera: TrackCamera, left: GrayImage, right: GrayImage, least: float, gates: RectificationGates,
+    features: FeatureGates,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Described features (N, 2) of both images that are most alike, near their rows, with disparities from some on."""
     orb = cv2.ORB.create(nfeatures=gates.num_features, fastThreshold=features.fast_threshold)
     places, bits = [], []
     for image in (left, right):
@@ -179,17 +222,14 @@ def find_pairs(
         places.append(np.asarray(cv2.KeyPoint.convert(found), np.float64) + 0.5)
         bits.append(np.unpackbits(np.asarray(descriptors, np.uint8), axis=1).astype(np.float32))
     here, there = places
-    band = camera.fx * np.radians(gates.band_deg)
     disparity, row = here[:, None, 0] - there[None, :, 0], there[None, :, 1] - here[:, None, 1]
     differ = bits[0].sum(axis=1)[:, None] + bits[1].sum(axis=1) - 2.0 * bits[0] @ bits[1].T
-    differ[(np.abs(row) > band) | (disparity < -band) | (disparity > gates.max_disparity * camera.width)] = np.inf
+    far = gates.max_disparity * camera.width
+    differ[(np.abs(row) > _band(camera, gates)) | (disparity < least) | (disparity > far)] = np.inf
     best = differ.argmin(axis=1)
     rows = np.arange(len(here))
     good = (differ[rows, best] <= features.max_bits) & (differ.argmin(axis=0)[best] == rows)
-    here, guess = here[good], there[best[good]]
-    there, good = follow(left, right, here, guess, levels=0, round_trip=None)
-    good &= np.linalg.norm(there - guess, axis=1) < gates.max_shift
-    return here[good], there[good]
+    return here[good], there[best[good]]
 
 
 def fit_rows(
