@@ -2,12 +2,16 @@
 """What the first run of a command costs more than the second.
 
     python benchmarks/first_run.py [--command adjust|demo|selfcheck]... [--rounds N] [--python PYTHON]
+    python benchmarks/first_run.py --bound
 
 Each command runs twice from an empty cache of compiled functions, as a whole process: wall time, and the CPU time of it
 and of the processes that compile for it. ``--python`` takes the groma of another environment, for example one into
 which a wheel with compiled functions was installed. What the two runs write must be the same.
 
 Medians; writes ``benchmarks/results/first_run.json`` and ``first_run.md``.
+
+``--bound`` says what no shorter loop can change: for each list of functions that a command calls, the CPU time of one
+process that compiles them, and that of as many functions with the same arguments and nothing in them.
 """
 
 from __future__ import annotations
@@ -19,10 +23,12 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import time
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
-from _workshop import RESULTS, machine
+from _workshop import RESULTS, environment, machine
 from latency import whole_process
 
 
@@ -60,12 +66,57 @@ def measure(command: list[str], written: str, folder: Path) -> dict[str, dict[st
     return found
 
 
+def bound(work: str) -> dict[str, float]:
+    """Compile what some work calls, and functions with the same arguments and nothing in them; in a new process."""
+    from groma._kernels.cache import counts
+    from groma.compilation.ahead import make_ready
+    from groma.compilation.needed import function, needed
+
+    make_ready(work)
+    listed = [(function(module, name), kinds) for module, name, kinds in needed(work)]
+    text = ["from groma._numba import loop"]
+    for number, (_, kinds) in enumerate(listed):
+        text.append(f"@loop\ndef f{number}({', '.join(f'a{k}' for k in range(len(kinds)))}):\n    pass")
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "with_nothing_in_them.py").write_text("\n".join(text), encoding="utf-8")
+        sys.path.insert(0, folder)
+        empty = import_module("with_nothing_in_them")
+        seconds = []
+        for functions in ([getattr(empty, f"f{number}") for number in range(len(listed))], [one for one, _ in listed]):
+            begin = time.process_time()
+            for one, (_, kinds) in zip(functions, listed, strict=True):
+                one.compile(kinds)
+            seconds.append(time.process_time() - begin)
+    inside = counts.compiled - 2 * len(listed)
+    return {"functions": len(listed), "inside them": inside, "empty_cpu_s": seconds[0], "cpu_s": seconds[1]}
+
+
+def say_bound() -> None:
+    """Print a table, each row from a process and a cache of its own."""
+    print("| list | functions | kernels inside them | CPU s | as many with nothing in them |")
+    print("|---|--:|--:|--:|--:|")
+    for work in ("adjust", "map"):
+        code = f"import json, first_run; print(json.dumps(first_run.bound({work!r})))"
+        with tempfile.TemporaryDirectory() as cache:
+            free = environment(None, NUMBA_CACHE_DIR=cache)
+            done = subprocess.run(
+                [sys.executable, "-c", code], cwd=Path(__file__).parent, env=free, check=True, capture_output=True
+            )
+        found = json.loads(done.stdout.splitlines()[-1])
+        counted = f"{found['functions']} | {found['inside them']}"
+        print(f"| {work} | {counted} | {found['cpu_s']:.1f} | {found['empty_cpu_s']:.1f} |", flush=True)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--command", action="append", choices=("adjust", "demo", "selfcheck"))
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--python", default=sys.executable)
+    parser.add_argument("--bound", action="store_true")
     arguments = parser.parse_args()
+    if arguments.bound:
+        say_bound()
+        return 0
     rows = []
     for name in arguments.command or ("adjust", "demo"):
         runs = []

@@ -134,6 +134,17 @@ def test_the_numbers_are_those_of_numba_alone(pair):
         assert pair[1](VALUES[:count].copy()).hex() == plain(VALUES[:count].copy()).hex()
 
 
+def test_an_unknown_version_of_numba_compiles_in_its_own_way(pair, monkeypatch, tmp_path):
+    expected = pair[1](VALUES).hex()
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "own"))
+    monkeypatch.setattr(inner, "is_known", False)
+    monkeypatch.setattr(inner._Steps, "_runPass", None)
+    weighted, total = _made(kernel, loop)
+    assert total(VALUES).hex() == expected
+    assert _has_machine_code(weighted) == [True]
+    assert weighted(1.0, 2.0) == pytest.approx(1.1 * 1.2 / 2 + 0.7 / 2.7, rel=1e-15)
+
+
 def test_a_thread_that_calls_while_another_one_compiles(pair):
     weighted, total = pair
     found = []
