@@ -84,7 +84,7 @@ def test_ctrl_c_while_mapping_says_how_to_go_on(tmp_path, monkeypatch, capsys):
     assert run(["map", str(tmp_path / "photos"), "-o", str(tmp_path / "out")]) == 130
     said = capsys.readouterr().err
     assert said.startswith("groma: interrupted; finished stages are kept in") and said.count("\n") == 1
-    assert "the same command resumes there" in said
+    assert "the same command goes on from there" in said
     assert os.listdir(tmp_path) == ["photos"]
 
 

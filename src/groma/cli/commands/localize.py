@@ -100,7 +100,7 @@ def localize(
             localizer = Localizer(map_, images, options=options, progress=say)
             found = localize_images(localizer, files, work, choice, say)
     except KeyboardInterrupt:
-        words = f"finished queries are kept in {work}: the same command resumes there."
+        words = f"finished queries are kept in {work}: the same command goes on from there."
         raise typer.Exit(PROCESS.tell(words)) from None
     if localizer.warning:
         console.warn(localizer.warning)

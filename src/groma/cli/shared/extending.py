@@ -111,4 +111,4 @@ def _with_progress(console: Console, made: Callable[[Callable[[str, int, int], N
         with interruptible() as interruption, console.stages() as stages, work_with(console.threads):
             return made(interruption.checking(stages))
     except KeyboardInterrupt:
-        raise typer.Exit(PROCESS.tell(f"{kept}: the same command resumes there.")) from None
+        raise typer.Exit(PROCESS.tell(f"{kept}: the same command goes on from there.")) from None

@@ -61,7 +61,7 @@ def run_map(
         with interruptible() as interruption, console.stages() as stages, loading("map", options.threads):
             return map_images(images, work, model, options, interruption.checking(stages), line_matches, survey, depth)
     except KeyboardInterrupt:
-        words = f"finished stages are kept in {work}: the same command resumes there."
+        words = f"finished stages are kept in {work}: the same command goes on from there."
         raise typer.Exit(PROCESS.tell(words)) from None
 
 
