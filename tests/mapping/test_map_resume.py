@@ -152,7 +152,7 @@ def test_a_full_disk_ends_the_command_in_one_line_and_loses_nothing(tmp_path, co
     assert not Path("out").exists() and has_stages(Path("out.work"))
     monkeypatch.setattr(mapping, "detect_segments", lambda *arguments: pytest.fail("segments were searched again"))
     assert run(command) == 0
-    assert capsys.readouterr().out.startswith("Resuming from the finished stages in out.work")
+    assert capsys.readouterr().out.startswith("Going on from the finished stages in out.work")
     assert os.listdir(tmp_path) == ["out"]
 
 

@@ -56,7 +56,7 @@ def run_map(
         *stages_of_map(options, start, survey is not None, line_matches is not None, depth is not None)
     )
     if has_stages(work):
-        console.say(f"Resuming from the finished stages in {work}.")
+        console.say(f"Going on from the finished stages in {work}, as far as they fit.")
     try:
         with interruptible() as interruption, console.stages() as stages, loading("map", options.threads):
             return map_images(images, work, model, options, interruption.checking(stages), line_matches, survey, depth)
