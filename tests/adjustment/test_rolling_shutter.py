@@ -142,7 +142,7 @@ def test_what_cannot_be_is_refused():
     with pytest.raises(InputError, match="needs the size of the images"):
         with_rolling_shutter(nowhere)
     seen = PointDepths([0], [0], [1.0], [0.1])
-    with pytest.raises(InputError, match="Depths, stereo pairs and planes"):
+    with pytest.raises(InputError, match="Depths, stereo pairs and measured planes"):
         with_rolling_shutter(scene.replace(point_depths=seen))
     with pytest.raises(InputError, match="reads along rows or columns; got 'diagonal'"):
         with_rolling_shutter(scene, "diagonal")

@@ -173,7 +173,7 @@ def _poses(home: Path) -> Iterator[Made]:
         "g2o": (G2O_3D, "a.g2o", photographs[:2]),
         "names": (bare, "a.txt", photographs),
         "transforms": ((work / "transforms.json").read_bytes(), "transforms.json", list(scene.images.names)),
-        "archive": ((work / "scene.npz").read_bytes(), "scene.npz", ["1.png", "mono_é.png"]),
+        "archive": ((work / "scene.npz").read_bytes(), "scene.npz", ["a/1.png", "mono_é.png"]),
     }
     for kind, (content, file, names) in kinds.items():
         read = functools.partial(read_camera_poses, images=names)

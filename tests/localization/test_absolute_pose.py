@@ -14,7 +14,6 @@ from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion, se3, so3
 from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose, pose_from_matches
 from groma.localization.pose.camera import QueryCamera
-from groma.localization.pose.gates import REFINEMENT
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pieces import cells_elsewhere
@@ -388,6 +387,6 @@ def test_the_noise_of_a_fit_to_few_matches_is_not_told_too_small():
     for _ in range(2000):
         basis = np.linalg.qr(rng.normal(size=(10, 6)))[0]
         noise = rng.normal(size=10)
-        found.append(_pull((noise - basis @ (basis.T @ noise)).reshape(5, 2), 6, REFINEMENT)[1] ** 2)
+        found.append(_pull((noise - basis @ (basis.T @ noise)).reshape(5, 2), 6)[1] ** 2)
     square, stiffness = _of_normal_noise(last_scale(5))
     assert np.mean(found) == pytest.approx(square / stiffness**2, rel=0.02)

@@ -200,7 +200,7 @@ def test_an_index_beside_nothing_that_can_be_written_is_not_kept(place, monkeypa
 
     monkeypatch.setattr(map_index.MapIndex, "write", refuse)
     found = Localizer(place / "map.npz", place / "images", index=place / "nowhere.npz")
-    assert "cannot be kept" in found.warning
+    assert "cannot be written" in found.warning
 
 
 def test_retrieval_keeps_its_contract(place):
@@ -271,7 +271,7 @@ def test_an_interrupted_run_goes_on(place, tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(module.Localizer, "localize", counting)
     assert run(arguments) == 130
-    assert "goes on" in capsys.readouterr().err
+    assert "resumes there" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     assert run(arguments) == 0
     assert len(calls) == 1 + len(QUERIES)  # two were finished, one was begun twice

@@ -9,6 +9,7 @@ shared system. mpi4py is imported here, and only where there is more than one ra
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
@@ -32,6 +33,10 @@ LAUNCHERS = (
 
 #: Numbers in one message, because MPI makes copies of it; and numbers added at once (cost: memory).
 SUMMED_AT_ONCE, ADDED_AT_ONCE = 1 << 19, 1 << 14
+
+#: A launcher passes on what a rank has printed when it comes to it, and drops the rest once it is told to end all ranks
+#: (cost: of waiting before a failure).
+_PASSING_ON_SECONDS = 0.2
 
 
 def started_as(environment: Mapping[str, str] = os.environ) -> tuple[int, int]:
@@ -109,6 +114,7 @@ class Ranks:
 
     def abort(self) -> None:
         """End all ranks at once: one of them cannot go on, and the others would wait for it."""
+        time.sleep(_PASSING_ON_SECONDS)
         self._world.Abort(1)
 
 
