@@ -85,6 +85,22 @@ def test_owners_are_told():
     assert owner_of("groma.scene.Scene") is None and owner_of("groma._version.__version__") == "groma"
 
 
+def imported_when_run(node: ast.AST) -> Iterator[str]:
+    """Yield what a module imports from groma, in functions too, except what only type checkers read."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING":
+            continue
+        yield from imported(child) if isinstance(child, (ast.Import, ast.ImportFrom)) else imported_when_run(child)
+
+
+def test_files_do_not_import_each_other_in_circles():
+    imports = {module: {*imported_when_run(tree)} - {module} for module, tree in TREES.items()}
+    modules = {m: {n if n in TREES else n.rpartition(".")[0] for n in names} for m, names in imports.items()}
+    while done := [module for module, names in modules.items() if not names & modules.keys() - {module}]:
+        modules = {module: names for module, names in modules.items() if module not in done}
+    assert sorted(modules) == []
+
+
 def test_names_are_listed_where_they_are_supported():
     """Elsewhere the underscore says what is private; a list beside it would say so twice.
 

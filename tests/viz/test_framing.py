@@ -7,8 +7,8 @@ from _scene import exact_scene
 
 from groma.geometry import se3
 from groma.scene import Lines, Points, Scene
+from groma.scene.local_frame import upward
 from groma.scene.synthetic.scenes import holistic
-from groma.scene.upright import upward
 from groma.viz.drawable import drawable
 from groma.viz.framing import FOR_CAMERAS, OPENING, StartingView, horizontal, starting_view
 

@@ -217,12 +217,9 @@ class CameraModel:
     def require_pinhole(self) -> None:
         """Raise :class:`~groma.errors.InputError` unless the model is free of distortion by its form."""
         if not self.has_pinhole_parameters:
-            from groma.cameras.registry import models  # it knows this class
-
-            free = ", ".join(other.name for other in models() if other.has_pinhole_parameters)
             raise InputError(
-                f"Straight image lines need a camera model without distortion ({free}); got {self.name}. "
-                f"Use the bearing factor for lines under distortion, or undistort the segments first."
+                f"Straight image lines need a camera model without distortion, such as PINHOLE; got {self.name}. "
+                "Use the bearing factor for lines under distortion, or undistort the segments first."
             )
 
     def pixel_difference(self, params: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:

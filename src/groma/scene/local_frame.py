@@ -63,3 +63,11 @@ def _middle_and_extent(scene: Scene) -> tuple[FloatArray, float]:
         return np.zeros(3), 0.0
     middle = np.median(places, axis=0)
     return middle, float(np.median(np.linalg.norm(places - middle, axis=1)))
+
+
+def upward(down: FloatArray) -> FloatArray:
+    """Return the direction (3,) opposite to the mean y axis (N, 3) of cameras; z where these do not agree."""
+    up = -down.sum(axis=0)
+    if np.linalg.norm(up) < 0.3 * max(len(down), 1):
+        return np.array([0.0, 0.0, 1.0])
+    return up / np.linalg.norm(up)

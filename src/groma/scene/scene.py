@@ -36,7 +36,6 @@ from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion, se3
 from groma.scene import survey
 from groma.scene.camera import Cameras, Rigs, Sensors
-from groma.scene.checks import check_scene
 from groma.scene.counts import measurements_of
 from groma.scene.image import Frames, Images
 from groma.scene.landmarks import Directions, Lines, Planes, Points
@@ -47,6 +46,7 @@ from groma.scene.observations import Keypoints, LineObservations, PointObservati
 from groma.scene.similarity import Similarity
 from groma.scene.standing_alone import standing_alone
 from groma.scene.table import moved_table, new_index_of, references, rows_of
+from groma.scene.validity import check_scene
 
 SomeScene = TypeVar("SomeScene", bound="Scene")
 _IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray
-from groma.scene.upright import upward
+from groma.scene.local_frame import upward
 from groma.viz.drawable import Drawable
 
 #: Share of the points, of the lines and of the cameras that count; the rest is farther from the middle than these.

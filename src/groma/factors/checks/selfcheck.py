@@ -73,8 +73,6 @@ def selfcheck(golden: Path | None = None, seed: int = 0) -> SelfCheckReport:
     InputError
         If `golden` is not a folder.
     """
-    import groma.factors  # noqa: F401 (fills the registry)
-
     rows = []
     for name, cls in registered().items():
         for check in compare_jacobians(cls.example(np.random.default_rng(seed))):

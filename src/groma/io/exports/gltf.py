@@ -27,8 +27,8 @@ from groma.io.drawn import Colours, DrawnCameras, drawn, drawn_cameras, middle_o
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Scene
 from groma.scene.checks import check_scene_given
+from groma.scene.local_frame import upward
 from groma.scene.patches import triangle_fans
-from groma.scene.upright import upward
 
 _FLOAT, _UNSIGNED_BYTE, _UNSIGNED_INT = 5126, 5121, 5125
 _POINTS, _LINES, _TRIANGLES = 0, 1, 4

@@ -22,8 +22,8 @@ from groma.io.drawn import Drawn, DrawnCameras, drawn, drawn_cameras, middle_of
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Scene
 from groma.scene.checks import check_scene_given
+from groma.scene.local_frame import upward
 from groma.scene.patches import triangle_fans
-from groma.scene.upright import upward
 
 #: Width of an image where it is not known, pixels.
 _WIDTH = 640.0

@@ -17,8 +17,8 @@ from groma.geometry import quaternion
 from groma.io.drawn import openings
 from groma.scene import Scene
 from groma.scene.line_intervals import line_pieces
+from groma.scene.local_frame import upward
 from groma.scene.similarity import Similarity
-from groma.scene.upright import upward
 from groma.viz import colours as _colours
 from groma.viz.colours import Colours
 from groma.viz.drawable import drawable, junctions
