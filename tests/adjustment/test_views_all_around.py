@@ -11,7 +11,7 @@ from groma.geometry import quaternion
 from groma.io.sequences.frame import SequenceCamera
 from groma.scene import Cameras, LineObservations, Lines, PointObservations, Points, Scene
 from groma.viz.drawable import drawable
-from groma.viz.report.overlays import projected_segments
+from groma.viz.report.overlays import projected_places
 
 NOISE = 0.3
 CASES = {
@@ -146,7 +146,8 @@ def test_points_at_the_border_of_a_panorama():
 def test_lines_are_drawn_all_around_a_panorama():
     """As curves in one piece, also behind the camera and across the border, through the measured ends."""
     truth, _, _ = room("EQUIRECTANGULAR")
-    curves = projected_segments(truth, 2, np.arange(truth.num_lines))
+    places = projected_places(truth, 2, np.arange(truth.num_lines))
+    curves = [row[kept] for row, kept in zip(*places, strict=True)]
     seen = truth.line_observations
     of_image = np.flatnonzero(seen.image_idx == 2)
     assert len(curves) == truth.num_lines == len(of_image)

@@ -1,28 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Overlays: numbers of lines, what is drawn over which image, that nothing is fetched and names cannot break out."""
+"""Numbers of lines, images of their segments, and crops of photographs around them."""
 
-import re
 import xml.etree.ElementTree as ElementTree
 
-import cv2
 import numpy as np
-import pytest
 from _scene import exact_scene
 
-from groma.errors import InputError
 from groma.geometry import se3
 from groma.scene import Scene, synthetic
-from groma.viz.report.overlays import line_overlays, observation_crop, overlay_section, projected_segments, residual_top
+from groma.viz.report.overlays import observation_crop, projected_places, residual_top
 from groma.viz.statistics import line_statistics
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """The photograph of the first image alone; the second has none."""
-    folder = tmp_path_factory.mktemp("images")
-    picture = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
-    cv2.imwrite(str(folder / "first.jpg"), picture)
-    return folder
 
 
 def moved(distance: float) -> Scene:
@@ -37,14 +24,9 @@ def moved(distance: float) -> Scene:
     return scene.replace(line_observations=seen.replace(segment=segment))
 
 
-def svg_of(fragment: str) -> ElementTree.Element:
-    """The drawing of a fragment; fails where it is not well formed."""
-    return ElementTree.fromstring(fragment)[0]
-
-
-def paths(fragment: str, kind: str) -> list[np.ndarray]:
-    found = [path for path in svg_of(fragment).iter("path") if path.get("class") == kind]
-    return [np.array([float(x) for x in re.findall(r"-?[\d.]+", path.get("d"))]).reshape(-1, 2) for path in found]
+def polylines(scene: Scene, image: int, lines: np.ndarray) -> list[np.ndarray]:
+    """Images of 3D segments without the places that are not seen."""
+    return [row[kept] for row, kept in zip(*projected_places(scene, image, lines), strict=True)]
 
 
 # ------------------------------------------------------------------------------------------------------ Statistics
@@ -101,19 +83,11 @@ def test_statistics_of_an_empty_scene():
 # -------------------------------------------------------------------------------------------------------- Overlays
 
 
-def test_measured_segments_lie_where_they_were_measured(folder):
-    scene = moved(0.5)
-    fragment = line_overlays(scene, folder)[0]
-    drawn = sorted(map(tuple, np.reshape(paths(fragment, "observed"), (-1, 4)).tolist()))
-    wanted = sorted(map(tuple, scene.line_observations.segment[:4].round(1).tolist()))
-    np.testing.assert_allclose(drawn, wanted, atol=0.051)
-
-
 def test_projected_segments_are_the_images_of_the_ends():
     scene = exact_scene()
     for image in (0, 1):
         rows = scene.line_observations.image_idx == image
-        found = projected_segments(scene, image, scene.line_observations.line_idx[rows])
+        found = polylines(scene, image, scene.line_observations.line_idx[rows])
         # Two places under a pinhole camera, where images of lines are straight; more under the other.
         assert [len(places) == 2 for places in found] == [image == 0] * 4
         ends = np.array([np.concatenate([places[0], places[-1]]) for places in found])
@@ -128,66 +102,12 @@ def test_segments_through_the_plane_of_the_camera_are_cut():
     segments = scene.lines.segments.copy()
     segments[:2] = ends
     scene = scene.replace(lines=type(scene.lines).through(segments))
-    cut, behind = projected_segments(scene, 0, np.array([0, 1]))
+    cut, behind = polylines(scene, 0, np.array([0, 1]))
     assert len(behind) == 0
     np.testing.assert_allclose(cut[0], [500 * 0.25 + 320, 510 * 0.1 + 240], atol=1e-9)
     # The image of the line leads through the principal point's far side: same direction, far away.
     assert np.isfinite(cut).all() and cut[1, 0] > 1e4
     np.testing.assert_allclose((cut[1] - [320, 240])[1] / (cut[1] - [320, 240])[0], 0.2 * 510 / (0.5 * 500), rtol=1e-9)
-
-
-def test_colours_follow_the_residual(folder):
-    good, bad = (line_overlays(moved(way), folder, top_px=1.0)[0] for way in (0.0, 5.0))
-    assert set(re.findall(r'stroke="(#\w+)"', good)) == {"#2c6fbb"}
-    assert set(re.findall(r'stroke="(#\w+)"', bad)) == {"#d9472b"}
-
-
-def test_photographs_lie_inside_and_missing_ones_are_named(folder):
-    first, second = line_overlays(exact_scene(), folder)
-    assert 'href="data:image/jpeg;base64,' in first and "no photograph" not in first
-    assert "<image" not in second and "no photograph" in second
-    by_name = line_overlays(exact_scene(), {"first.jpg": folder / "first.jpg"})
-    assert by_name == [first, second]
-
-
-def test_names_cannot_break_out():
-    for fragment in line_overlays(exact_scene(("<script>&", '"><b>')), None):
-        assert "<script" not in fragment and "<b>" not in fragment
-        svg_of(fragment)
-
-
-def test_section_needs_nothing_from_elsewhere(folder):
-    section = overlay_section(exact_scene(), folder)
-    assert section.startswith("<section") and section.endswith("</section>")
-    assert not re.search(r"https?:|<script|<link|@import|url\(", section)
-
-
-def test_images_are_spread_over_the_scene():
-    scene = synthetic.corridor("tiny", seed=0).truth
-    names = [re.search("<figcaption>([^:]*):", figure)[1] for figure in line_overlays(scene, None, 4)]
-    places = [scene.images.names.index(name) for name in names]
-    assert len(places) == 4 and places == sorted(places)
-    assert max(np.diff(places)) <= scene.num_images / 2
-
-
-@pytest.mark.parametrize("scene", [Scene(), exact_scene().points_only()], ids=["empty", "points"])
-def test_scenes_without_lines_give_nothing(scene):
-    assert line_overlays(scene, None) == []
-    assert overlay_section(scene, None) == ""
-
-
-def test_images_of_unknown_size():
-    scene = exact_scene()
-    unknown = scene.replace(cameras=scene.cameras.replace(width=np.zeros(2, int), height=np.zeros(2, int)))
-    left, top, width, height = map(float, svg_of(line_overlays(unknown, None)[0]).get("viewBox").split())
-    ends = scene.line_observations.segment[:4].reshape(-1, 2)
-    assert (ends > [left, top]).all() and (ends < [left + width, top + height]).all()
-
-
-@pytest.mark.parametrize("wrong", [{"max_images": 0}, {"max_size": 0}])
-def test_wrong_numbers_are_refused(wrong):
-    with pytest.raises(InputError, match=next(iter(wrong))):
-        line_overlays(exact_scene(), None, **wrong)
 
 
 def test_crops_show_the_surroundings():

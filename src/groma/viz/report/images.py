@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from groma import cameras
 from groma._counted import natural_key
 from groma._typing import FloatArray, IntArray
 from groma.execution import begin
@@ -20,7 +21,7 @@ from groma.viz.drawable import Drawable
 from groma.viz.pack import pack, pack_whole, thin
 from groma.viz.pictures import ImageFiles, image_file, jpeg_address, read_picture, warn_of_names_outside
 from groma.viz.report.kept import Kept, places_of
-from groma.viz.report.overlays import is_straight, projected_places
+from groma.viz.report.overlays import projected_places
 
 #: Photographs in the page, the longer side of each, pixels, and what all of them may weigh, characters.
 MAX_PHOTOS = 60
@@ -74,7 +75,7 @@ def image_data(scene: Scene, kept: Kept, states: Sequence[Drawable], photographs
     seen, pieces = scene.line_observations, one_line_per_interval(scene)
     point_rows = _by_image(kept.point_observations, scene.point_observations.image_idx, scene.num_images)
     segment_rows = _by_image(kept.line_observations, seen.image_idx, scene.num_images)
-    samples = 2 if all(is_straight(name) for name in scene.cameras.models) else _SAMPLES
+    samples = 2 if all(cameras.model(name).has_pinhole_parameters for name in scene.cameras.models) else _SAMPLES
     points_seen = np.bincount(scene.point_observations.image_idx, minlength=scene.num_images)
     lines_seen = np.bincount(seen.image_idx, minlength=scene.num_images)
     used = _used(scene)
