@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The application: which commands there are. Each lives in a file of its own name."""
+"""The application and its commands, each defined in the file of its name."""
 
 from collections.abc import Callable
 from typing import Annotated
@@ -34,7 +34,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
 )
-#: Name, function, and a few words for the list of ``groma --help``; the command's own help says the rest.
+#: Name, function, and summary for the list of ``groma --help``; the docstring is the full help of a command.
 _Commands = tuple[tuple[str, Callable[..., None], str], ...]
 _COMMANDS: _Commands = (
     ("demo", demo.demo, "Map the photographs included in groma: start here."),

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The entry point: run the application, and leave at once after Ctrl-C.
 
-Ctrl-C is answered from the first line of :func:`main` on, so this module imports only what Python has loaded anyhow.
-Before that, while the interpreter starts and finds this file, Python answers.
+Ctrl-C is handled from the first line of :func:`main` on, so this module imports only what Python has loaded already.
+Before that, Python's own handler is in force.
 
 Exit codes: 0 success, 1 a known error (one line on standard error), 2 wrong usage, 130 interrupted.
 """
@@ -12,8 +12,7 @@ import os
 import sys
 from io import TextIOWrapper
 
-#: New objects after which garbage is looked for; Python's own number is 700. Modules are a hundred thousand that stay.
-#: Cost: time only.
+#: New objects between garbage collections (Python: 700); importing creates a hundred thousand that stay. Cost: time.
 _COLLECT_AFTER = 50_000
 
 
@@ -29,7 +28,7 @@ def run(arguments: list[str] | None = None) -> int:
     except SystemExit as exit_request:
         code = exit_request.code
         if code == INTERRUPTED and PROCESS.asked:
-            PROCESS.tell()  # between the lines of the command line itself
+            PROCESS.tell()  # interrupted within Typer
         return code if isinstance(code, int) else int(code is not None)
     except (KeyboardInterrupt, Exception) as error:
         if not (isinstance(error, KeyboardInterrupt) or PROCESS.explains(error)):
@@ -47,11 +46,11 @@ def main() -> None:
         answer_signals()
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, TextIOWrapper):
-                # A name that the terminal cannot show is shown by its numbers; it is no reason to end.
+                # Characters that the terminal cannot encode are escaped.
                 stream.reconfigure(errors="backslashreplace")
         code = run()
         ignore_signals()
-    except KeyboardInterrupt:  # before signals are answered, or a second time, while the first is answered
+    except KeyboardInterrupt:  # before the handlers are installed, or while one runs
         from groma.cli.shared.interrupt import PROCESS
 
         code = PROCESS.tell()
@@ -61,7 +60,7 @@ def main() -> None:
         # Worker threads may still be inside a compiled kernel; the normal exit would wait for them.
         sys.stderr.flush()
         os._exit(code)
-    gc.freeze()  # memory goes back as a whole: no search for garbage in it
+    gc.freeze()  # the process ends: no garbage collection
     sys.exit(code)
 
 

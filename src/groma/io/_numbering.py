@@ -19,7 +19,7 @@ def numbered_keypoints(scene: Scene) -> tuple[IntArray, IntArray, IntArray]:
     order : (n,) int
         The rows of point observations followed by keypoints, image by image.
     ends : (N + 1,) int
-        Where the images begin and end in ``order``.
+        Bounds of the images in ``order``.
     number : (n,) int
         The number of each row.
     """

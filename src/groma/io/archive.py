@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The groma archive: a whole scene in one ``.npz`` file, exact, without pickle.
 
-Every column of every table is one array named ``table.column``; ``format`` and ``version`` say what the file is.
+Every column of every table is one array named ``table.column``; ``format`` and ``version`` identify the file.
 ``numpy.load`` opens it too. Writing the same scene twice gives the same bytes, on every machine, because nothing is
 compressed: measurements hardly shrink, and pycolmap's wheel (4.2), when it is imported before Python's zlib, breaks
 zlib's compression for the whole process (it exports functions of the same names). Compressed archives are read too.
@@ -52,7 +52,7 @@ def write_archive(scene: Scene, path: str | os.PathLike[str], force: bool = Fals
                     continue
                 fill = item.metadata.get("fill")
                 if fill is not None and not isinstance(value, tuple) and (value == fill).all():
-                    continue  # as if left out; readers that do not know the column can read the file
+                    continue  # left out, so that readers without this column can read the file
                 array = np.array(value, dtype="<U1" if not value else None) if isinstance(value, tuple) else value
                 _write_array(file, f"{table.name}.{item.name}", array)
 

@@ -24,9 +24,9 @@ def atomic_output(
     Parameters
     ----------
     path : path
-        Where the result goes. Its folder must exist.
+        The result. Its folder must exist.
     force : bool
-        Replace what is there. Without it an existing file or folder is refused.
+        Replace an existing file or folder, which is refused otherwise.
     workshop_in : path, optional
         Folder, on the same disk, where the draft is built: what a killed process leaves is then found there, and not
         beside ``path``.

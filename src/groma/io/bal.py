@@ -40,12 +40,12 @@ _KIND = "BAL file"
 
 
 def read_bal(path: str | os.PathLike[str]) -> Scene:
-    """Read a BAL file; each camera becomes an image with a calibration of model ``BAL`` of its own.
+    """Read a BAL file; each camera becomes an image with its own calibration of model ``BAL``.
 
     Parameters
     ----------
     path : path
-        Plain text, .bz2 or .gz (told by content, not by name).
+        Plain text, .bz2 or .gz, recognised by content.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def read_bal(path: str | os.PathLike[str]) -> Scene:
 
 
 def write_bal(scene: Scene, path: str | os.PathLike[str], force: bool = False) -> None:
-    """Write the points of a scene as a BAL file, compressed as the name says (.bz2, .gz).
+    """Write the points of a scene as a BAL file, compressed if the name ends in .bz2 or .gz.
 
     Raises
     ------
@@ -165,7 +165,7 @@ def looks_like_bal(head: bytes) -> bool:
 
 
 def _recognise(path: Path, head: bytes) -> bool:
-    """Whether three counts begin the text of a file that may be compressed."""
+    """Whether a file, possibly compressed, starts with three counts."""
     try:
         for magic, module in ((b"BZh", bz2), (b"\x1f\x8b", gzip)):
             if head.startswith(magic):

@@ -18,8 +18,8 @@ from groma.scene import Scene
 def check_format(scene_format: SceneFormat | str, scene: Scene, holds: Iterable[str], tolerance: float = 1e-9) -> None:
     """Check that a registered format keeps its promises, by writing a scene and reading it.
 
-    The name chooses the format; what it holds comes back the same; a file that is there is replaced only with force; a
-    file cut short raises :class:`~groma.errors.FileFormatError` or, without a word about its length, gives a scene.
+    The name selects the format; its content survives writing and reading; existing files are replaced only with
+    force; a truncated file raises :class:`~groma.errors.FileFormatError` or, if it holds no length, gives a scene.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ def convert(source: str | os.PathLike[str], target: str | os.PathLike[str], forc
     target : path
         Its name determines the format, as in :func:`groma.write_scene`. LIMAP's structures are kept.
     force : bool
-        Replace what is there.
+        Replace an existing file.
 
     Raises
     ------

@@ -3,7 +3,7 @@
 
 In come the folder and the names of photographs; ``rooms/IMG_1.jpg`` has ``rooms/IMG_1.png``, or ``IMG_1.png`` where the
 folder has no folders. Out come images of depths along the optical axis, 0 where nothing is known: what is zero,
-negative or not finite, and 65535 in whole numbers of 16 bit. Headers are looked at before anything is expanded.
+negative or not finite, and 65535 in whole numbers of 16 bit. Headers are checked before data are decompressed.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class DepthMaps:
     folder: Path
     #: Numbers in files per unit of length; None: 1000 for whole numbers (millimetres), 1 for others (metres).
     scale: float | None = None
-    #: Every map has a unit of its own, as where it was guessed from one photograph.
+    #: Every map has its own scale, as those of monocular depth networks.
     relative: bool = False
 
     def __post_init__(self) -> None:
@@ -101,7 +101,7 @@ class DepthMaps:
         return depth
 
     def holds_millimetres(self, depth: DepthMap, path: Path) -> bool:
-        """Whether a map that was read as metres without being told so looks like millimetres: large whole numbers."""
+        """Whether a map read in metres by default probably holds millimetres: large whole numbers."""
         if self.scale is not None or self.relative or path.suffix.lower() == ".png":
             return False
         known = depth[depth > 0.0]

@@ -60,7 +60,7 @@ _TORO = {
     "VERTEX3": (7, "VERTEX_SE3:QUAT"),
     "EDGE3": (29, "EDGE_SE3:QUAT"),
 }
-#: What begins the tags of landmarks, and of their measurements, and ends that of a pose with a landmark.
+#: Prefixes of tags of landmarks and of their measurements, and the suffix of a pose with a landmark.
 _LANDMARKS = ("VERTEX_XY", "VERTEX_TRACKXYZ", "EDGE_SE2_XY", "EDGE_SE3_TRACKXYZ", "EDGE_SE3_XYZ", "EDGE_BEARING_SE2_XY")
 #: Numbers of an edge of TORO in space that states no information (file format).
 _BARE_EDGE3 = 8
@@ -70,7 +70,7 @@ _HALF_ANGLES = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
 #: What they do to each number of an upper triangle, and an upper triangle of the identity.
 _HALF_ANGLE_PAIRS = np.outer(_HALF_ANGLES, _HALF_ANGLES)[np.triu_indices(6)]
 _ONE = ["1" if row == column else "0" for row, column in zip(*np.triu_indices(6), strict=True)]
-#: First bytes that say what a file is (cost: time only).
+#: First bytes by which a file is recognised (cost: time only).
 _HEAD_BYTES = 4096
 #: Coordinates of a planar motion within (rho, omega) (file format).
 _PLANAR = np.array([0, 1, 5])
@@ -84,7 +84,7 @@ def read_g2o(path: str | os.PathLike[str]) -> PoseGraph:
     InputError
         If there is no such file.
     FileFormatError
-        If a line is not what its tag promises, names a pose that is not there, or has a tag that is not known.
+        If a line does not fit its tag, refers to a missing pose, or has an unknown tag.
     """
     place = existing(path)
     with reading(place, "g2o file"):
@@ -117,14 +117,14 @@ def write_g2o(graph: PoseGraph, path: str | os.PathLike[str], force: bool = Fals
 
 
 def looks_like_g2o(head: bytes) -> bool:
-    """Tell from the first bytes of a file, decompressed where needed, whether a pose graph begins there."""
+    """Whether the first bytes of a file, decompressed if necessary, are those of a pose graph."""
     lines = (line.split(None, 1) for line in head.splitlines())
     tag = next((words[0].decode("ascii", "replace") for words in lines if words and words[0][:1] != b"#"), "")
     return tag in (*_NUMBERS, *_TORO, "FIX") or tag.startswith("PARAMS_SE")
 
 
 def is_g2o(path: Path) -> bool:
-    """Tell whether a file holds a pose graph: by its name (.g2o, .g2o.gz), or by how it begins."""
+    """Whether a file holds a pose graph, by its name (.g2o, .g2o.gz) or its first bytes."""
     if path.name.lower().endswith((".g2o", ".g2o.gz")):
         return True
     if not path.is_file():

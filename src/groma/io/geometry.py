@@ -37,7 +37,7 @@ class Geometry:
         return float(np.linalg.norm(np.ptp(every, axis=0))) if len(every) else 0.0
 
     def surface_points(self, count: int = 200_000, seed: int = 0) -> FloatArray:
-        """Return the points, or, where there are triangles, so many places evenly at random on them, (n, 3).
+        """Return the points (n, 3), or ``count`` uniform random samples of the triangles.
 
         Raises
         ------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Poses of cameras as measurements, from any file that holds some; those by name may say how exact they are."""
+"""Poses of cameras as measurements, from any file of poses; those by image name may have covariances."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ def read_camera_poses(path: str | os.PathLike[str], images: Sequence[str]) -> Po
     path : path
         The file.
     images : sequence of str
-        Names of the images, to tell which pose is whose where a file has none.
+        Names of the images, to assign poses of a file without names.
 
     Raises
     ------
     FileFormatError, InputError
-        If the file is damaged, or it cannot be told which pose is whose.
+        If the file is damaged, or its poses cannot be assigned to images.
     """
     if _by_name(Path(path)):
         return read_measured_poses(path)

@@ -35,7 +35,7 @@ class PoseConvention:
     def cam_from_world(self, rotation: FloatArray, place: FloatArray) -> FloatArray:
         """Return poses (N, 7) [qx qy qz qw tx ty tz] of rotations and places (N, 3), as the file has them.
 
-        Rotations are (N, 3, 3), (N, 4) or (N, 3), as :attr:`rotation` says; that they are rotations was checked before.
+        Rotations are (N, 3, 3), (N, 4) or (N, 3), depending on :attr:`rotation`; they are valid rotations.
         """
         turn = self.quaternions(rotation)
         if self.direction == "world_from_cam":

@@ -12,7 +12,7 @@ a pose graph of g2o                              the numbers in the names are id
 lines ``name x y z qx qy qz qw``                 by name, as of a model
 ===============================================  ===================================================================
 
-Whatever else is refused. What was concluded and is not in the file is said in a sentence.
+Anything else is refused. Conclusions that are not in the file are returned as sentences.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def read_poses(path: str | os.PathLike[str], photographs: Sequence[str]) -> Pose
     Raises
     ------
     InputError
-        If no photograph has a pose, or it cannot be told which pose is whose.
+        If no photograph has a pose, or poses cannot be assigned to photographs.
     FileFormatError
         If the file is damaged or of an unknown kind.
     """

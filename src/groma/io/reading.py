@@ -14,8 +14,8 @@ from groma.errors import FileFormatError, GromaError, InputError
 def reading(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
     """Turn whatever a parser raises on a damaged file into :class:`~groma.errors.FileFormatError`.
 
-    Parsers meet hostile bytes with many kinds of exceptions (of zipfile, bz2, zlib, NumPy, struct, pycolmap); a
-    caller cares only that the file is not what it claims to be. Missing files and missing permissions are told apart.
+    Parsers raise many kinds of exceptions on damaged files (of zipfile, bz2, zlib, NumPy, struct, pycolmap). Missing
+    files and missing permissions have messages of their own.
     """
     try:
         with warnings.catch_warnings():

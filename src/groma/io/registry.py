@@ -42,8 +42,8 @@ class SceneFormat:
     recognise: Callable[[Path, bytes], bool] | None = None
     #: Reads a path that was recognised; raises FileFormatError if it is damaged.
     read: Callable[[Path], Scene] | None = None
-    #: Writes a scene to a path, whole or not at all (:func:`groma.io.atomic.atomic_output`), replacing what is there
-    #: only if the third argument is true. Where ``keeps_structures``, a fourth is what :func:`write_scene` calls like.
+    #: Writes a scene to a path atomically (:func:`groma.io.atomic.atomic_output`), replacing an existing one only
+    #: if the third argument is true. Where ``keeps_structures``, a fourth is what :func:`write_scene` calls like.
     write: Callable[..., None] | None = None
     #: Raises InputError if the format cannot hold a scene.
     check: Callable[[Scene], object] | None = None
@@ -114,7 +114,7 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
         if one.recognise is not None and one.read is not None and one.recognise(place, head):
             return one.read(place)
     if place.is_dir() and (colmap := _FORMATS["colmap"].read) is not None:
-        return colmap(place)  # it says what is missing in the folder
+        return colmap(place)  # its error names the missing files
     if looks_like_g2o(head):
         raise FileFormatError(f"{place} is a pose graph, not a scene. Optimise it with groma adjust.")
     begin = f"begins with {head[:20].decode(errors='backslashreplace')!r}" if head else "is empty"
@@ -143,7 +143,7 @@ def write_scene(
         ``colmap``, ``colmap_text``, ``archive``, ``bal``, ``transforms``, ``ply``, ``obj``, ``gltf``, ``dxf``,
         ``rerun`` or a registered one, to override the name.
     force : bool
-        Replace what is there.
+        Replace an existing file.
     like : Structures, optional
         For COLMAP models: the LIMAP structures that the scene came from
         (:func:`groma.io.limap.structures.structures_of`), to keep what a scene cannot hold.

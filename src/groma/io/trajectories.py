@@ -36,7 +36,7 @@ from groma.scene.table import Table, column
 #: Lines of a pose in a .log: its numbers, and a matrix of 4x4.
 _LOG_LINES = 5
 
-#: Lines that hold something, with their numbers, one after the other.
+#: Lines with content, and their numbers.
 Rows = Iterable[tuple[int, str]]
 
 
@@ -98,7 +98,7 @@ def read_trajectory(
     path : path
         The file; it may be compressed by gzip.
     format : str
-        ``tum``, ``kitti``, ``euroc`` or ``log``; ``auto`` looks at the first line that holds numbers.
+        ``tum``, ``kitti``, ``euroc`` or ``log``; ``auto`` decides by the first line with numbers.
     timestamps : (N,) float, optional
         Times of the poses of a KITTI file, seconds. Without them the pose in line i has time i.
 

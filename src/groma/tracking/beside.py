@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Work in another thread while the caller goes on."""
+"""Work in another thread, in parallel with the caller."""
 
 from __future__ import annotations
 

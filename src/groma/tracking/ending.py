@@ -37,7 +37,7 @@ class Adjusted:
     #: Of the last adjustment of all keyframes, if there was one.
     report: SolveReport | None
     right_turn: RightTurn
-    #: None where planes were not looked for in points and lines.
+    #: None if planes were not searched in points and lines.
     planes: PlaneOutcome | None
 
     def numbers(self, camera: TrackCamera) -> dict:

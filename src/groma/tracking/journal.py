@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Finished keyframes on disk while a track goes on, so that little is lost when it is killed; and what it sees now."""
+"""Finished keyframes on disk during a track, so that little is lost if it is killed, and the current picture."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from groma.io.sequences.frame import Frame
     from groma.tracking.tracker import TrackedFrame, Tracker
 
-#: The frame of the moment is written every so many seconds, reduced to at most so many columns (cost: time of writing).
+#: Seconds between two writes of the current picture, and its maximum width (cost: time of writing).
 GLANCE, COLUMNS = 0.4, 640
 #: The whole map is written when this many seconds have passed, and writing took less than this share of the time (cost:
 #: of writing).
@@ -32,7 +32,7 @@ class Journal:
 
     Rows are those of TUM: time, place, quaternion; in ``frames.txt`` the number of the map follows. ``statuses.txt``
     has a row for every frame (time, status, numbers of points, lines and planes that agree, whether it is a keyframe),
-    and ``now.npz`` the latest picture with what is followed in it.
+    and ``now.npz`` the latest picture with its tracked features.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -57,7 +57,7 @@ class Journal:
             self._next_glance = time.monotonic() + GLANCE
 
     def _glance(self, tracked: TrackedFrame, frame: Frame, tracker: Tracker) -> None:
-        """Write the picture of a frame and what is followed in it, in the pixels of the reduced picture."""
+        """Write the picture of a frame and its tracked features, in pixels of the reduced picture."""
         import cv2
 
         scale = min(1.0, COLUMNS / frame.gray.shape[1])

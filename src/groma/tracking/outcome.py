@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a track says: of each frame, of all of them, and in numbers."""
+"""The results of a track: of each frame, of all of them, and statistics."""
 
 from __future__ import annotations
 

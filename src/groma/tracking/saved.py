@@ -106,7 +106,7 @@ def read_saved_map(folder: str | os.PathLike[str]) -> SavedMap:
     Raises
     ------
     InputError
-        If it is something else, or does not say where its frames are.
+        If it is something else, or does not name its frames.
     """
     path = Path(folder)
     if not path.exists():

@@ -58,11 +58,11 @@ _Told = Callable[[TrackProgress], bool | None]
 
 @dataclass(frozen=True)
 class SequenceResult(TrackResult):
-    """Outcome of :func:`track`: that of the tracker, and what the sequence says about it."""
+    """Outcome of :func:`track`: that of the tracker, with properties of the sequence."""
 
     #: What became of each frame, in order.
     frames: tuple[TrackedFrame, ...] = ()
-    #: Name of the sequence, and what its frames hold: ``rgbd``, ``stereo`` or ``mono``.
+    #: Name of the sequence, and the kind of its frames: ``rgbd``, ``stereo`` or ``mono``.
     name: str = ""
     kind: str = ""
     #: Whether it was ended early.
@@ -84,8 +84,8 @@ class SequenceResult(TrackResult):
         if self.sources:
             numbers["sources"] = list(self.sources)
         if len(self.sources) == 1:
-            numbers["images"] = self.sources[0]["path"]  # where groma localize looks for them
-        # The first frame of one camera has a pose once the map begins, after its answer.
+            numbers["images"] = self.sources[0]["path"]  # read by groma localize
+        # The first frame of a monocular track gets its pose later, when the map is initialised.
         placed = [self.trajectory, *(submap.trajectory for submap in self.submaps)]
         times = {time for trajectory in placed for time in trajectory.timestamps.tolist()}
         numbers["frames_without_pose"] = [
@@ -118,7 +118,7 @@ class SequenceResult(TrackResult):
         title : str
             Heading of the page.
         force : bool
-            Replace what is there.
+            Replace an existing folder.
         images : path or mapping, optional
             Photographs for the page: a folder, or files by the names of keyframes.
 
@@ -173,7 +173,7 @@ def track(
     name : str
         What the sequence is called in the summary; by default the path.
     map_ : path, optional
-        OUT of an earlier track, whose map is used and extended: the track begins lost in it, and continues in its world
+        OUT of an earlier track, whose map is used and extended: the track starts lost in it, and continues in its world
         frame once relocalised.
     source : FrameSource, optional
         Location of the frames, so that the result can be used as a map later; by default the path.
@@ -273,7 +273,7 @@ def _follow(
 ) -> tuple[Tracker, bool]:
     """Track all frames, noting in ``frames`` what became of each; return the tracker and whether none was left out.
 
-    Where the tracker would rather begin anew, another one does.
+    If the tracker requests a restart, another one takes over.
     """
     total = sequence.num_frames or 0
     try:

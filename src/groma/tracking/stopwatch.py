@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Where the time of a frame goes."""
+"""Timings of the stages of a frame."""
 
 from __future__ import annotations
 

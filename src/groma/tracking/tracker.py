@@ -69,7 +69,7 @@ class Tracker:
     right_turn
         Rotation of the right camera of a stereo pair, if known from an earlier track.
     saved
-        The map of an earlier track (:func:`groma.tracking.map.saved_map.map_of_scene`): the track begins lost in it.
+        The map of an earlier track (:func:`groma.tracking.map.saved_map.map_of_scene`): the track starts lost in it.
     """
 
     def __init__(
@@ -129,12 +129,12 @@ class Tracker:
         frame, following
             The frame, and the one after it if it is there already: its planes are found meanwhile, to the same result.
 
-        The answer does not wait for the work on the map that this frame causes: that goes on until the next one.
+        The pose is returned before the work on the map that this frame causes, which may last until the next frame.
 
         Returns
         -------
         TrackedFrame
-            Its pose and status. A frame that cannot be used is skipped and says why; only a frame of the wrong size or
+            Its pose and status. An unusable frame is skipped, with the reason; only a frame of the wrong size or
             kind raises.
 
         Raises
@@ -233,7 +233,7 @@ class Tracker:
         present, mapper, unconfirmed = self._present, self._mapper, attempt.unconfirmed
         before = present.pose
         if self._lost_for == 0:
-            # The frame before is the nearest there is to look for.
+            # The previous frame is the best reference.
             mapper.keep_present(present, watch)
         with watch("find"), work_with(None if mapper.threaded else 1):
             guesses = [attempt.predicted, present.pose] + ([unconfirmed.pose] if unconfirmed is not None else [])
@@ -255,7 +255,7 @@ class Tracker:
     def _with_turn(self, data: FrameFeatures, predicted: FloatArray, prior_sigma: FloatArray):
         """Put a turn that the whole image shows in place of a prediction that the image denies.
 
-        While the frame before has no pose, turns from frame to frame tell roughly where the camera looks.
+        While the previous frame has no pose, rotations from frame to frame give the approximate orientation.
         """
         present, points, gates = self._present, self.map.points, self.options.gates.turns
         assert present.data is not None
@@ -321,7 +321,7 @@ class Tracker:
             self._lost_since = now
         self._lost_for += 1
         self._guess = data.gray, guess
-        # A map that one camera begins has a scale of its own, in which no other map can be joined.
+        # A monocular map has its own scale, so no other map can be merged with it.
         stays = self._saved is not None and data.frame.depth is None and data.frame.right is None
         long = self._lost_for > self._gates.lost_frames and now - self._lost_since > self._gates.restart_seconds
         if long and not stays:

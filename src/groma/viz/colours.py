@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Colours of numbers, of directions, and of things to be told apart."""
+"""Colours of numbers, directions and groups."""
 
 from __future__ import annotations
 

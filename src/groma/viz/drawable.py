@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A scene as plain arrays to draw: places, camera axes, pieces of planes, and the residual of every observation.
 
-Residuals are computed here from scene and camera model alone, so that a picture shows what is in the file and not
-what a solver said about it. The residual of a line end is the way from the measured end to the image of the line. It is
-found on bearings, which works for every camera model: the bearing is moved into the plane of camera centre and line and
-projected again; what is left along the image of the line is removed.
+Residuals are computed here from scene and camera model alone, so that a picture shows what is in the file and not what
+a solver reported. The residual of a line end is the vector from the measured end to the image of the line. It is
+computed on bearings, which works for every camera model: the bearing is moved into the plane of camera centre and line
+and projected again; what is left along the image of the line is removed.
 """
 
 from __future__ import annotations

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Where the 3D view of the page starts: behind the cameras and a little above, as near as the landmarks allow.
+r"""Initial viewpoint of the 3D view: behind the cameras and a little above, as near as the landmarks allow.
 
-Cameras that stand around the scene are in the picture, too, as long as the landmarks do not become small for them.
+Cameras around the scene are in the picture, too, unless the landmarks would become small.
 
-What is far from all the rest (matches gone wrong, the horizon, a stray camera) does not count. What counts fills the
-picture: with :math:`r` and :math:`u` the coordinates of a place to the right and upwards, :math:`b` that towards the
-viewer, and :math:`a` the tangent of half the opening, the viewer at :math:`(p_r, p_u, e)` sees it if
-:math:`|r - p_r| \le a_r (e - b)` and :math:`|u - p_u| \le a_u (e - b)`. The least :math:`e` is that of the two
-extreme places on either side, in closed form.
+Outliers (wrong matches, the horizon, a stray camera) are ignored. Everything else fills the picture: with :math:`r` and
+:math:`u` the coordinates of a place to the right and upwards, :math:`b` that towards the viewer, and :math:`a` the
+tangent of half the opening, the viewer at :math:`(p_r, p_u, e)` sees it if :math:`|r - p_r| \le a_r (e - b)` and
+:math:`|u - p_u| \le a_u (e - b)`. The least :math:`e` is that of the two extreme places on either side, in closed form.
 """
 
 from __future__ import annotations
@@ -20,18 +19,18 @@ from groma._typing import BoolArray, FloatArray
 from groma.scene.local_frame import upward
 from groma.viz.drawable import Drawable
 
-#: Share of the points, of the lines and of the cameras that count; the rest is farther from the middle than these.
+#: Shares of landmarks and of cameras, nearest to the middle first, that are considered.
 LANDMARK_SHARE, CAMERA_SHARE = 0.95, 0.98
-#: Nor does count what is farther from the middle than this many times the usual: one in twenty is not always all.
+#: Landmarks farther from the middle than this many times the median are ignored, too.
 FAR = 4.0
-#: Share of the landmarks that count on each side of the picture.
+#: Quantile of the landmarks that must be in the picture, on each side.
 EDGE = 0.997
 #: Tangents of half the opening of the viewer, across and upwards. Its focal length is 0.6 times its width (at most 1.1
 #: of its height), and it is about four thirds as wide as high.
 OPENING = np.array([0.83, 0.6])
-#: Room around what counts.
+#: Margin around them.
 MARGIN = 1.06
-#: How much farther away than the landmarks need the view may start for the cameras to be in it.
+#: Factor by which the distance may grow for the cameras to be in the picture.
 FOR_CAMERAS = 1.15
 #: Angle aside and above, radians.
 ASIDE, ABOVE = 0.45, 0.38
@@ -39,7 +38,7 @@ ASIDE, ABOVE = 0.45, 0.38
 
 @dataclass(frozen=True)
 class StartingView:
-    """Where the viewer starts: it turns about a pivot."""
+    """Initial viewpoint of a viewer that orbits a pivot."""
 
     pivot: FloatArray
     up: FloatArray
@@ -50,14 +49,14 @@ class StartingView:
 
 
 def starting_view(scene: Drawable, middle: FloatArray) -> StartingView:
-    """Return a view of cameras, points and lines, without what is far from all of them.
+    """Return a view of cameras, points and lines without outliers.
 
     Parameters
     ----------
     scene : Drawable
         What is drawn.
     middle : (3,) float64
-        A place to look at if the scene has no landmarks.
+        Target if the scene has no landmarks.
     """
     points, segments = (_finite(places) for places in (scene.points[:, None], scene.segments))
     landmarks = np.concatenate([points.reshape(-1, 3), segments.reshape(-1, 3)])
@@ -94,7 +93,7 @@ def horizontal(up: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _finite(places: FloatArray) -> FloatArray:
-    """Items (N, k, 3) whose places are all known, and within single precision, in which a page holds them."""
+    """Items (N, k, 3) whose places are finite in single precision, in which a page holds them."""
     return places[(np.abs(places) <= np.finfo(np.float32).max).all(axis=(1, 2))]
 
 
@@ -106,9 +105,9 @@ def _near(distances: FloatArray, share: float, far: float) -> BoolArray:
 
 
 def _compromise(landmarks: FloatArray, cameras: FloatArray) -> tuple[FloatArray, float]:
-    """Return pivot and distance for the landmarks, moved towards those for cameras and landmarks as far as may be.
+    """Return pivot and distance for the landmarks, moved towards those for landmarks and cameras within the limit.
 
-    Places seen from two viewpoints are seen from any between them, because the conditions are linear.
+    What is visible from two viewpoints is visible from all between them, because the conditions are linear.
     """
     pivot, distance = _fitted(landmarks, cameras)
     if not (len(landmarks) and len(cameras)):
@@ -125,7 +124,7 @@ def _compromise(landmarks: FloatArray, cameras: FloatArray) -> tuple[FloatArray,
 
 
 def _fitted(landmarks: FloatArray, cameras: FloatArray) -> tuple[FloatArray, float]:
-    """Return the pivot and the distance from which places (N, 3), right, up and back, just fill the picture."""
+    """Return the pivot and the distance from which places (N, 3), as right, up and back, fill the picture."""
     places = np.concatenate([landmarks, cameras])
     opening = OPENING / MARGIN
 
@@ -143,7 +142,7 @@ def _fitted(landmarks: FloatArray, cameras: FloatArray) -> tuple[FloatArray, flo
 
 
 def _camera_size(scene: Drawable, distance: float) -> float:
-    """Return a size at which cameras can be seen and neighbours do not hide each other."""
+    """Return a size at which cameras are visible and neighbours do not overlap."""
     if len(scene.centers) < 3:
         return 0.018 * distance
     from scipy.spatial import KDTree

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Arrays as text: how numbers travel in a page."""
+"""Arrays as text in a page."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from groma._typing import FloatArray, IntArray
 
 
 def pack(values: FloatArray) -> str:
-    """Return numbers as base64 of single precision; what is not finite becomes zero."""
+    """Return numbers as base64 of single precision; non-finite ones become zero."""
     finite = np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
     return base64.b64encode(np.ascontiguousarray(finite, dtype="<f4").tobytes()).decode()
 
@@ -35,5 +35,5 @@ def thin(count: int, limit: int) -> IntArray:
 
 
 def script_json(content: dict[str, Any]) -> str:
-    """Return JSON in which nothing can end a script element or begin a comment."""
+    """Return JSON that cannot close a script element or open a comment."""
     return json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")

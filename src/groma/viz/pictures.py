@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Photographs for pictures: found by name, read small, written as data addresses."""
+"""Photographs of a page: found by name, read at reduced size, written as data URLs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _QUALITY = 78
 
 
 def image_file(images: ImageFiles | None, name: str) -> Path | None:
-    """Return the file of an image; None where there is none, and where the name leads out of the folder."""
+    """Return the file of an image; None if there is none, or if the name leads out of the folder."""
     if images is None:
         return None
     if isinstance(images, Mapping):
@@ -38,14 +38,14 @@ def image_file(images: ImageFiles | None, name: str) -> Path | None:
 
 
 def folder_of_images(model: str | os.PathLike[str], names: Iterable[str]) -> Path | None:
-    """Return the folder that holds photographs of a model, found by what lies beside it; None where none does.
+    """Return the folder of the photographs of a model, searched near the model; None if there is none.
 
     Parameters
     ----------
     model : path
-        A folder or file of a model. Folders that are tried: the one that ``summary.json`` in it names, as ``groma map``
-        writes it; then ``images`` in the model, beside it, and one and two folders higher, as in COLMAP's projects;
-        then the folder itself or that of the file, from which ``transforms.json`` names its images.
+        A folder or file of a model. Searched in order: the folder named in its ``summary.json``, which ``groma map``
+        writes; ``images`` in the model, beside it, and one and two folders higher, as in COLMAP's projects; the folder
+        itself or that of the file, relative to which ``transforms.json`` names images.
     names : iterable of str
         Names of the images; the folder holds one of the first hundred at least.
     """
@@ -61,7 +61,7 @@ def folder_of_images(model: str | os.PathLike[str], names: Iterable[str]) -> Pat
 
 
 def warn_of_names_outside(images: ImageFiles | None, names: Iterable[str]) -> None:
-    """Warn of images that are not shown because their names lead out of the folder of photographs."""
+    """Warn of images that are left out because their names lead out of the folder of photographs."""
     if images is None or isinstance(images, Mapping):
         return
     if wrong := outside(names):
@@ -77,7 +77,7 @@ def warn_of_names_outside(images: ImageFiles | None, names: Iterable[str]) -> No
 def read_picture(path: str | os.PathLike[str], max_size: int | None = None) -> Picture | None:
     """Return an image file as red, green, blue, at most ``max_size`` pixels on its longer side; None if unreadable.
 
-    A note of the camera on how it was held is ignored: pixel coordinates count from the corner of the stored image.
+    The EXIF orientation is ignored: pixel coordinates refer to the stored image.
     """
     import cv2
 
@@ -94,7 +94,7 @@ def read_picture(path: str | os.PathLike[str], max_size: int | None = None) -> P
 
 
 def data_address(picture: Picture) -> str:
-    """Return a picture as the address of a JPEG that is its own content."""
+    """Return a picture as a data URL of a JPEG."""
     import cv2
 
     colours = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
@@ -103,7 +103,7 @@ def data_address(picture: Picture) -> str:
 
 
 def jpeg_address(picture: Picture, budget: int) -> str:
-    """Return a picture as a data address of at most about ``budget`` characters, made smaller until it fits."""
+    """Return a picture as a data URL of at most about ``budget`` characters, scaled down until it fits."""
     address = data_address(picture)
     for _ in range(4):
         if len(address) <= budget:
@@ -116,7 +116,7 @@ def jpeg_address(picture: Picture, budget: int) -> str:
 
 
 def _smaller(picture: Picture, scale: float) -> Picture:
-    """Return a picture at a scale below one. From half of the size on, bilinear weights touch every pixel."""
+    """Return a picture at a scale below one; from one half on, bilinear interpolation uses every pixel."""
     import cv2
 
     size = [max(1, round(scale * side)) for side in picture.shape[1::-1]]

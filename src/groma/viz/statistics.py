@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Numbers of every line: how long it is, how many images see it, how far its image lies from what was measured."""
+"""Statistics of lines: length, number of images, residuals."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from groma.viz.drawable import Drawable, drawable, rms_by_group
 class LineStatistics:
     """Numbers of L lines and their M observations, in the order of the scene."""
 
-    #: (L,) lengths of what images support of the lines, scene units.
+    #: (L,) lengths of the intervals supported by images, scene units.
     length: FloatArray
     #: (L,) numbers of different images that observe them.
     num_images: IntArray
     #: (L,) root mean square distance of the measured ends from the image of the line, pixels; NaN where unobserved.
     residual_px: FloatArray
-    #: (M, 2, 2) way from each measured end to the image of the line, pixels; NaN where the line has none.
+    #: (M, 2, 2) vector from each measured end to the image of the line, pixels; NaN where the line has none.
     end_residuals: FloatArray
     #: (M,) root mean square distance of the two ends of each observation, pixels.
     observation_residual_px: FloatArray
@@ -34,14 +34,14 @@ def line_statistics(scene: Scene, shown: Drawable | None = None) -> LineStatisti
 
     .. math:: r_l = \sqrt{\frac{1}{2 |O_l|} \sum_{o \in O_l} \sum_{e = 1}^{2} \|\Delta_{oe}\|^2}
 
-    with the ways :math:`\Delta` from the measured ends to the image of the line, across that image.
+    with the vectors :math:`\Delta` from the measured ends to the image of the line, perpendicular to it.
 
     Parameters
     ----------
     scene : Scene
         Lines and their observations.
     shown : Drawable, optional
-        What :func:`groma.viz.drawable.drawable` gives for the same scene, where it is there already.
+        Result of :func:`groma.viz.drawable.drawable` for the same scene, if known.
 
     Returns
     -------
@@ -63,7 +63,7 @@ def line_statistics(scene: Scene, shown: Drawable | None = None) -> LineStatisti
 
 
 def images_of(landmark_idx: IntArray, image_idx: IntArray, num_landmarks: int) -> IntArray:
-    """Return how many different images observe each landmark; one may observe a landmark more than once."""
+    """Return the number of distinct images that observe each landmark."""
     width = int(image_idx.max(initial=0)) + 1
     pairs = np.sort(landmark_idx.astype(np.int64) * width + image_idx)  # np.unique takes fifty times as long
     return np.bincount(pairs[np.diff(pairs, prepend=-1) > 0] // width, minlength=num_landmarks)

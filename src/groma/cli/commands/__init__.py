@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The commands, one per file: check what can be refused before any work, call the library, write, say."""
+"""The commands, one per file: validate the options, call the library, write the results, print a summary."""

@@ -14,8 +14,8 @@ from groma.errors import InputError
 if TYPE_CHECKING:
     from groma.adjustment.survey.align import Alignment
 
-#: Places with the largest residuals that are told (convention: what a table on a screen can hold).
-_TOLD = 5
+#: Rows of the table of largest residuals (convention: what a screen can hold).
+_LISTED = 5
 
 
 def align(
@@ -79,7 +79,7 @@ def _say(console: Console, found: "Alignment") -> None:
     )
     if found.angles is not None:
         console.say(f"Orientations differ by {np.degrees(np.median(found.angles)):.3g} degrees (median).")
-    worst = np.argsort(-distance)[:_TOLD]
+    worst = np.argsort(-distance)[:_LISTED]
     rows = [
         [
             found.names[row],

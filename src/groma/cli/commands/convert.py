@@ -75,7 +75,7 @@ def _convert(source: Path, target: Path, console: Console, force: bool) -> dict[
 
 
 def _missing_images(source: Path, scene: "Scene") -> list[str]:
-    """Say which images are not there, where others of the scene lie beside it."""
+    """Warn of missing image files, if other images of the scene are found."""
     from groma._counted import first_of
     from groma.viz.pictures import folder_of_images, image_file
 
@@ -91,7 +91,7 @@ def _missing_images(source: Path, scene: "Scene") -> list[str]:
 
 
 def _unknown_sizes(scene: "Scene", target: Path) -> list[str]:
-    """Say that a model of COLMAP, which has a place for the sizes of images, is written without."""
+    """Warn of a COLMAP model that is written without image sizes."""
     from groma._counted import counted
 
     cameras = scene.cameras
@@ -105,7 +105,7 @@ def _unknown_sizes(scene: "Scene", target: Path) -> list[str]:
 
 
 def _unseen_points(source: Path, scene: "Scene", target: Path) -> list[str]:
-    """Say that no image sees any of the points, where the target has a place for that."""
+    """Warn of points without observations, if the target format can hold observations."""
     if not scene.num_points or len(scene.point_observations) or target.suffix.lower() == ".json":
         return []
     is_opensfm = source.stem.startswith("reconstruction") or (source / "reconstruction.json").is_file()

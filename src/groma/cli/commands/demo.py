@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""``groma demo``: what ``groma map`` does, on real photographs that are shipped with the package."""
+"""``groma demo``: ``groma map`` on real photographs shipped with the package."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""``groma evaluate``: a result against a reference, in the scores of the field."""
+"""``groma evaluate``: a result compared with a reference, by the usual scores."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,7 +13,7 @@ from groma.cli.shared.console import Console
 from groma.cli.shared.input import check_inputs, refuse_idle
 from groma.errors import InputError
 
-# As groma.io.trajectories and groma.evaluation.trajectory have them; not imported, because they load NumPy.
+# Repeated from groma.io.trajectories and groma.evaluation.trajectory, whose import would load NumPy.
 _Format = Literal["auto", "tum", "kitti", "euroc"]
 _Alignment = Literal["se3", "sim3", "none"]
 _StepUnit = Literal["frames", "metres", "seconds"]
@@ -296,5 +296,5 @@ def trajectory(
 
 
 def _percent(share: float) -> str:
-    """A share in percent; a dash where there is nothing to have a share of."""
+    """A share in percent; a dash for NaN."""
     return f"{100 * share:.1f} %" if share == share else "–"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""``groma localize``: where photographs were taken, in a map that is there already."""
+"""``groma localize``: the poses of photographs in an existing map."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from groma.localization.placed import PlacedImage
     from groma.localization.result import LocalizeResult
 
-#: Localised photographs in the table; those that are not are always told (convention: what a table on a screen can
-#: hold).
+#: Localised photographs in the table; the others are always listed (convention: what a screen can hold).
 _SHOWN = 12
 _MIN_LENGTH = 15.0
 
@@ -117,7 +116,7 @@ def localize(
 
 
 def _say(console: Console, result: "LocalizeResult") -> None:
-    """A row for every photograph, at most a dozen of those that are localised; why the others are not; a count."""
+    """Print a table with at most a dozen of the localised photographs, the reasons of the others, and the counts."""
     found = result.queries
     localized = [one for one in found if one.status == "localized"]
     hidden = 0 if console.verbose else max(len(localized) - _SHOWN, 0)

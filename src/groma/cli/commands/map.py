@@ -244,14 +244,14 @@ def _names_in(folder: Path) -> list[str]:
 
 
 def _has_noise(poses: Path | None, stated: str | None) -> bool:
-    """Whether it is known how exact given poses are; else that is estimated."""
+    """Whether the noise of given poses is known; otherwise it is estimated."""
     from groma.io.measured_poses import holds_covariances
 
     return poses is not None and (stated is not None or holds_covariances(poses))
 
 
 def _check_start(model: Path | None, poses: Path | None, rig: Path | None) -> None:
-    """Check that what is known beforehand does not exclude each other."""
+    """Refuse options that exclude each other."""
     if model is not None and poses is not None:
         raise InputError("--model and --poses exclude each other: a model has points. Leave one of them out.")
     if rig is not None and (model is not None or poses is not None):
@@ -259,7 +259,7 @@ def _check_start(model: Path | None, poses: Path | None, rig: Path | None) -> No
 
 
 def _rigs(console: Console, images: Path, path: Path | None) -> "tuple[RigDescription, ...]":
-    """Return the rigs of a file, or of the one in the folder of photographs, and say what they hold."""
+    """Return the rigs of the file given, or of the one in the folder of photographs; print a summary."""
     from groma.io.colmap.rigs import RIG_FILE, check_rigs, read_rigs
     from groma.mapping.photographs import image_files
 
@@ -276,7 +276,7 @@ def _rigs(console: Console, images: Path, path: Path | None) -> "tuple[RigDescri
 def _start(
     console: Console, images: Path, model: Path | None, poses: Path | None, options: "MapOptions"
 ) -> "tuple[Scene | None, MapOptions]":
-    """Return the scene to start from, None where the photographs must do; and options that know its calibration."""
+    """Return the initial scene, None if there are only photographs, and the options adapted to its calibration."""
     from groma.io import read_scene
     from groma.mapping.posed.given import scene_at_poses
 

@@ -56,7 +56,7 @@ def view(
     console.say(sentence_of(scene))
     if images is None and (images := folder_of_images(source, scene.images.names)) is not None:
         console.say(f"Photographs: {images}")
-    # Once the page is there, Ctrl-C is the way to end and no accident.
+    # Once the page is served, Ctrl-C is the regular way to end.
     with serving(scene, images, port, say=console.warn) as shown, contextlib.suppress(KeyboardInterrupt):
         address = f"http://localhost:{shown.server.get_port()}"
         if images is not None and shown.num_pictures == 0:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What commands share: text, progress, interruption, whole or no output."""
+"""Shared by commands: options, console, progress, interruption, atomic output."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What every command gets on top of its own options: --no-color, completion of names and files, "did you mean"."""
+"""Options of every command, completion of names and files, and suggestions for misspelled values."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from groma.errors import did_you_mean
 
 
 def one_of(*names: str) -> Callable[[str], Sequence[str]]:
-    """Return a completion by names; parts of installed packages are not among them."""
+    """Return a completion by names; those of plugins are not included."""
     return lambda incomplete: [name for name in names if name.lower().startswith(incomplete.lower())]
 
 
 class Panel(str):
-    """A heading of ``--help``; makes the options under it. Those without a heading come first."""
+    """A heading of ``--help``, which declares the options under it. Those without a heading come first."""
 
     def option(self, text: str, *flags: str, choices: Sequence[str] = (), **settings: Any) -> Any:
         """Declare an option with its help; ``--name`` of the argument unless flags say otherwise."""
@@ -36,7 +36,7 @@ class Panel(str):
         return typer.Option(*flags, help=text, rich_help_panel=self or None, **settings)
 
 
-#: What every command takes, and what stands under no heading.
+#: Options of every command, and options without a heading.
 GENERAL, PLAIN = Panel("General"), Panel("")
 Json = Annotated[
     str | None,
@@ -49,15 +49,15 @@ Threads = Annotated[
     GENERAL.option("Use at most N threads. Default: one per core, where that pays.", "--threads", min=1, metavar="N"),
 ]
 NoColor = Annotated[bool, GENERAL.option("Use no colours; so does the environment variable NO_COLOR.", "--no-color")]
-#: Of commands that draw no random numbers: accepted, so that a script can pass it to every command, and not shown.
+#: For commands without random numbers: accepted, so that a script can pass it to every command, but hidden.
 NoSeed = Annotated[int, typer.Option("--seed", min=0, hidden=True)]
 
 
 class Command(TyperCommand):
-    """A command whose help has headings, and that suggests what may have been meant by a value that is no choice."""
+    """A command whose help has headings and which suggests the nearest choice for a misspelled value."""
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """Return what follows the name of the command in its usage: what must be given, and ``[what may be]``."""
+        """Return the usage after the name of the command: required parts and ``[optional ones]``."""
         pieces = ["[OPTIONS]"]
         for one in self.get_params(ctx):
             if one.param_type_name == "argument":
@@ -68,14 +68,14 @@ class Command(TyperCommand):
         return pieces
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write the options under their headings, in the order in which these first appear."""
+        """Write the options under their headings, in order of first appearance."""
         sections: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
         for parameter in self.get_params(ctx):
             record = parameter.get_help_record(ctx)
             if record is not None:
                 name, text = record
                 if parameter.param_type_name == "argument":
-                    name = parameter.metavar or parameter.name  # the kind of value is said by the help
+                    name = parameter.metavar or parameter.name  # the help says what kind of value
                 name = re.sub(r"[<\[]([\w|]+)[>\]]$", r"\1", name)  # choices: one|another
                 sections.setdefault(_heading(parameter), []).append((name, text))
         for heading, records in sections.items():
@@ -84,7 +84,7 @@ class Command(TyperCommand):
                     formatter.write_dl(records)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse as usual, but refuse what is empty: as a name it would stand for the folder that one is in."""
+        """Parse as usual, but refuse empty values: an empty path would mean the current folder."""
         for before, word in zip(["", *args], args, strict=False):
             option, _, value = word.partition("=") if word.startswith("--") else (before, "", word)
             if not value and (word.endswith("=") or not word):
@@ -92,7 +92,7 @@ class Command(TyperCommand):
                 raise typer.BadParameter(f"a value{where} is empty. Is a variable of the shell not set?", ctx=ctx)
         try:
             return super().parse_args(ctx, args)
-        except Exception as error:  # of wrong usage: its class is Click's or Typer's own, by Typer's version
+        except Exception as error:  # wrong usage: a class of Click or of Typer, depending on the version
             if isinstance(error, typer.BadParameter):
                 error.message = _in_plain_words(error.message)
             if is_terminal(sys.stderr):
@@ -101,13 +101,13 @@ class Command(TyperCommand):
 
 
 def _break_message(error: Any) -> None:
-    """Break the message of wrong usage between words where somebody looks at it; other errors stay as they are."""
+    """Wrap the message of a usage error for a terminal; other errors stay as they are."""
     if hasattr(error, "format_message"):
         message = wrapped(f"Error: {error.format_message()}", terminal_width()).removeprefix("Error: ")
         error.format_message = lambda: message
 
 
-#: What Typer says of a value that it cannot take, and what groma says.
+#: Typer's messages about invalid values, and those of groma.
 _PLAIN = (
     (r"Value error, ", ""),
     (r"Input should be a valid integer.*", "must be a whole number."),
@@ -118,7 +118,7 @@ _PLAIN = (
 
 
 def _in_plain_words(message: str) -> str:
-    """Return what is wrong with a value, and which choice may have been meant."""
+    """Return the message in plain words, with the nearest choice."""
     for words, plain in _PLAIN:
         message = re.sub(f"^{words}", plain, message)
     named, among, choices = message.partition("is not one of")
@@ -139,16 +139,16 @@ def console_of(
     threads: Threads = None, json_target: Json = None, quiet: Quiet = False, verbose: Verbose = False,
     no_color: NoColor = False, seed: NoSeed = 0,
 ) -> Console:  # fmt: skip
-    """Return the console that obeys the options that every command takes."""
+    """Return the console for the options of every command."""
     forbid_colours(no_color)
     return Console(quiet, verbose, json_target, threads)
 
 
 def with_common_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command a console and the options of :func:`console_of`, and let the shell complete files it takes.
+    """Add a console and the options of :func:`console_of` to a command, and completion of files by the shell.
 
-    A parameter that is a dataclass stands for the options that its fields declare. An option that the command has
-    itself, too, is given to both.
+    A parameter that is a dataclass is replaced by the options that its fields declare. An option that the command
+    declares, too, is passed to both.
     """
     own, every = inspect.signature(command, eval_str=True), inspect.signature(console_of, eval_str=True).parameters
     common = {name: one for name, one in every.items() if name not in own.parameters}
@@ -179,7 +179,7 @@ def with_common_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _declared(group: type[Any], own: Mapping[str, inspect.Parameter]) -> list[inspect.Parameter]:
-    """Return the options that the fields of a dataclass declare, without those that the command has itself."""
+    """Return the options declared by the fields of a dataclass, except those that the command declares."""
     kinds = get_type_hints(group, include_extras=True)
     return [
         inspect.Parameter(item.name, inspect.Parameter.KEYWORD_ONLY, default=item.default, annotation=kinds[item.name])
@@ -189,18 +189,17 @@ def _declared(group: type[Any], own: Mapping[str, inspect.Parameter]) -> list[in
 
 
 def forbid_colours(wanted: bool) -> None:
-    """Show no colours from now on, in processes that are started either; nothing if not wanted."""
+    """If set, disable colours in this process and its children."""
     if wanted:
         os.environ["NO_COLOR"] = "1"
 
 
 def left_to_shell(incomplete: str) -> list[str]:
-    """Complete nothing: shells complete files themselves then."""
+    """Complete nothing, so that the shell completes files."""
     return []
 
 
-#: What options may be given, as far as groma itself has it; tests compare them with the registries, which take a second
-#: to import.
+#: Choices of options without plugins; tests compare them with the registries, which take a second to import.
 LOSSES = "auto none huber soft_l1 cauchy tukey geman_mcclure barron truncated".split()
 LINEAR_SOLVERS = "auto dense sparse pcg".split()
 LINE_CHARTS = "cartesian orthonormal_left orthonormal_right free_left free_right".split()

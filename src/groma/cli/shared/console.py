@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a command says: text, tables, warnings, and what goes on meanwhile."""
+"""Output of a command: text, tables, warnings and progress."""
 
 import os
 import re
@@ -15,24 +15,24 @@ _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS
 
 
 class Console:
-    """Speaks on standard output, or on standard error when the report goes to standard output."""
+    """Prints to standard output, or to standard error if the report goes to standard output."""
 
     def __init__(self, quiet: bool, verbose: bool, json_target: str | None, threads: int | None = None) -> None:
         self.quiet = quiet
         self.verbose = verbose and not quiet
-        #: Where a machine-readable report goes; None for no report.
+        #: Value of --json; None: no report.
         self.json_target = json_target
-        #: The most threads that may be used; None for as many as pay.
+        #: Maximum number of threads; None: automatic.
         self.threads = threads
         self._stream = sys.stderr if json_target == "-" else sys.stdout
         self._plan = Plan()
         if threads is not None:
-            # Read by the numerical libraries when they are loaded, which has not happened yet.
+            # Read by the numerical libraries when they are loaded, which is later.
             for variable in _THREAD_VARIABLES:
                 os.environ[variable] = str(threads)
 
     def say(self, text: str = "") -> None:
-        """Print a sentence unless --quiet; on a terminal it is broken between words."""
+        """Print a sentence unless --quiet, wrapped on a terminal."""
         if not self.quiet:
             text = wrapped(text, terminal_width()) if is_terminal(self._stream) else text
             print(text, file=self._stream, flush=True)
@@ -55,9 +55,9 @@ class Console:
             warn(text)
 
     def warn_of_all(self, texts: Sequence[str], most: int = 3) -> None:
-        """Print warnings; of more than ``most`` that differ in their numbers alone the first, and how many follow it.
+        """Print warnings; of more than ``most`` that differ in numbers only, the first and the count of the others.
 
-        A folder with one thing wrong in every file is told once, and the report for machines has all of them.
+        The machine-readable report has all of them.
         """
         alike: dict[str, list[str]] = {}
         for text in texts:
@@ -70,24 +70,24 @@ class Console:
                 self.warn(f"{first} The same of {counted(len(others), 'others')}.")
 
     def wrote(self, *places: object) -> None:
-        """Say that something was written, and where."""
+        """Print the places of written results."""
         if not self.quiet:
             for place in places:
                 line = f"Wrote {place}"
-                if not isinstance(place, Path) and is_terminal(self._stream):  # a path alone is copied
+                if not isinstance(place, Path) and is_terminal(self._stream):  # paths are copied
                     line = wrapped(line, terminal_width())
                 print(line.replace("Wrote", paint("Wrote", "green", self._stream), 1), file=self._stream, flush=True)
 
     def wrote_page(self, folder: Path) -> None:
-        """Say that a folder was written, and where the page in it is."""
+        """Print the place of a written folder, and that of the page in it."""
         self.wrote(folder)
-        if not self.quiet:  # never broken: it is copied
+        if not self.quiet:  # not wrapped, so that it can be copied
             print(f"Open {(folder / 'report.html').absolute()} in a browser.", file=self._stream, flush=True)
 
     def expect_compilation(self, work: str) -> None:
-        """Say so when something must be compiled that a kind of work needs, and let other processes help with it.
+        """Announce compilation if the work needs any, and let other processes help with it.
 
-        Nothing is said, and no process started, unless it happens.
+        Nothing is printed, and no process started, if everything is compiled.
         """
         from groma.compilation import ahead
 
@@ -99,18 +99,18 @@ class Console:
         self.say("First run: compiling for this machine. Later runs start at once.")
 
     def progress(self) -> Progress:
-        """Return the progress of an adjustment; see :class:`groma.cli.shared.progress.Line` for where it is shown."""
+        """Return the progress of an adjustment, shown by :class:`groma.cli.shared.progress.Line`."""
         return Progress(self.quiet)
 
     def expect_stages(self, *names: str) -> None:
-        """Tell which stages are to come, so that they are counted; what was told first counts."""
+        """Declare the stages, so that they are numbered; only the first call counts."""
         if not self._plan.names:
             self._plan = Plan(names)
 
     def stages(self) -> Stages:
-        """Return the progress of a pipeline of named stages, which are counted where they were announced.
+        """Return the progress of a pipeline of named stages, numbered if they were declared.
 
-        With --verbose every stage leaves a line with its time, on a terminal or not.
+        With --verbose the time of every stage is printed.
         """
         return Stages(self.quiet, self._plan, finished=self.detail if self.verbose else None)
 
@@ -121,7 +121,7 @@ def warn(text: str) -> None:
 
 
 def complain(what: str, text: str, style: Style) -> None:
-    """Print a sentence and what it is on standard error; on a terminal it is broken between words."""
+    """Print a sentence and its kind on standard error, wrapped on a terminal."""
     line = f"{what} {text}"
     if is_terminal(sys.stderr):
         line = wrapped(line, terminal_width()).replace(what, paint(what, style, sys.stderr), 1)

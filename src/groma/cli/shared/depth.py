@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Options of commands that take depth maps of photographs, and what is said of them."""
+"""Options and messages of commands that take depth maps of photographs."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ RelativeDepth = Annotated[
 
 
 def depth_maps(folder: Path | None, scale: float | None, relative: bool, images: Path) -> DepthMaps | None:
-    """Return what the options mean; None without a folder."""
+    """Return the depth maps of the options; None without a folder."""
     from groma.io.depth_maps import DepthMaps
 
     refuse_idle(
@@ -53,7 +53,7 @@ def depth_maps(folder: Path | None, scale: float | None, relative: bool, images:
 
 
 def say_depth(console: Console, numbers: dict[str, Any]) -> None:
-    """Say what depth maps were worth: the entry ``depth`` of ``summary.json``."""
+    """Print the accuracy of depth maps: the entry ``depth`` of ``summary.json``."""
     if not numbers:
         return
     what = f"{counted(numbers['num_point_depths'], 'depths')} of points in {counted(numbers['num_maps'], 'maps')}"

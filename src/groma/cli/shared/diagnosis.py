@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The diagnosis as commands make and say it: never in the way of the result it is about."""
+"""The diagnosis of commands; if it fails, the result is written all the same."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ if TYPE_CHECKING:
     from groma.cli.shared.console import Console
     from groma.solver.observability.diagnosis import Diagnosis
 
-#: The stage as it is said.
+#: Name of the stage.
 DIAGNOSING = "finding what the data determine"
 
 
 def try_diagnosis(
     make: Callable[[], Diagnosis], num_images: int, console: Console, wanted: bool | None = None
 ) -> Diagnosis | None:
-    """Return what ``make`` finds; None if it is not wanted or not possible, which is said.
+    """Return the diagnosis; None, with a message, if it is not requested or fails.
 
     Parameters
     ----------
@@ -26,9 +26,9 @@ def try_diagnosis(
     num_images : int
         Images of the scene.
     console : Console
-        Where reasons are said.
+        Prints the reason.
     wanted : bool, optional
-        None: unless there are many images.
+        None: up to a number of images.
     """
     from groma.adjustment.diagnosis import MANY_IMAGES
 
@@ -41,13 +41,13 @@ def try_diagnosis(
         with console.stages() as say:
             say(DIAGNOSING, 0, 1)
             return make()
-    except Exception as error:  # whatever it is, the result of the command is worth more
+    except Exception as error:  # of any kind: the result is worth more
         console.warn(f"The diagnosis failed: {error}")
         return None
 
 
 def say_diagnosis(diagnosis: Mapping[str, Any] | None, console: Console) -> None:
-    """Say the problems, and with --verbose all findings."""
+    """Print the problems, with --verbose all findings."""
     if diagnosis is None:
         return
     for finding in diagnosis["findings"]:

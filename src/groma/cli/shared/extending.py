@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Maps that are there as the beginning of others: with photographs added, or two of them joined; with progress."""
+"""Extending a map by photographs, and merging two maps, with progress."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _Made = TypeVar("_Made")
 Names = tuple[str, ...]
-#: Stages as they are said: of a map that is described, of photographs, of two maps.
+#: Names of stages: of the index of a map, of photographs, of two maps.
 DESCRIBING: Names = (
     *("describing the images of the map", "placing the points of the map"),
     "comparing images of the map with the rest",
@@ -39,7 +39,7 @@ def extend_map(
     following: Names,
     seed: int,
 ) -> ExtendedModel:
-    """Localise photographs in a map; return the model of all of them. ``following`` are the stages after that."""
+    """Localise photographs in a map and return the joint model. ``following`` are the later stages."""
     from groma.localization.calibration import CalibrationChoice
     from groma.localization.extension import extended_model
     from groma.localization.run import query_files
@@ -69,7 +69,7 @@ def merge_maps(
     following: Names,
     seed: int,
 ) -> MergedModel:
-    """Find how two maps lie to each other; return the model of both. ``following`` are the stages after that."""
+    """Estimate the transformation between two maps and return their joint model. ``following`` are the later stages."""
     from groma.localization.joining.merging import merged_model
     from groma.localization.localizer import photographs_of
 
@@ -91,7 +91,7 @@ def merge_maps(
 
 
 def photograph_folder(output: Path, force: bool) -> Path:
-    """Return the folder for links to the photographs; refuse one that holds something else."""
+    """Return the folder for links to the photographs; refuse one with other files."""
     folder = output.with_name(f"{output.name}.images")
     if force and folder.is_dir():
         if any(path.is_file() and not path.is_symlink() for path in folder.rglob("*")):
@@ -101,12 +101,12 @@ def photograph_folder(output: Path, force: bool) -> Path:
 
 
 def end_queries(output: Path) -> None:
-    """Remove what was kept of photographs that were localised."""
+    """Remove the checkpoints of localised photographs."""
     shutil.rmtree(output.with_name(f"{output.name}.queries"), ignore_errors=True)
 
 
 def check_extension(extend: Path | None, map_images: Path | None, others: dict[str, object]) -> None:
-    """Refuse options that do not go with the map that is extended, or that need one."""
+    """Refuse options that exclude --extend, or that need it."""
     if extend is None and map_images is not None:
         raise InputError("--map-images tells where the photographs of --extend MAP are. Add --extend, or leave it out.")
     given = [name for name, value in others.items() if value is not None]
@@ -117,7 +117,7 @@ def check_extension(extend: Path | None, map_images: Path | None, others: dict[s
 def _localizer(
     map_: Path, images: Path | None, seed: int, say: Callable[[str, int, int], None], warnings: list[str]
 ) -> Localizer:
-    """Return what localises in a map; what could not be done as wanted is added to the warnings."""
+    """Return the localiser of a map; add its warning, if any, to the list."""
     from groma.localization.localizer import LocalizeOptions, Localizer
     from groma.localization.pose.absolute_pose import PoseOptions
 

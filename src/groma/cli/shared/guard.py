@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Turn what a command raises into an exit code and one line; a traceback is only for errors of groma itself."""
+"""Exceptions of a command as an exit code and one line; only bugs of groma give a traceback."""
 
 import functools
 import sys
@@ -18,7 +18,7 @@ P = ParamSpec("P")
 
 
 def guard(command: Callable[P, None]) -> Callable[P, None]:
-    """Wrap a command: known errors end in exit code 1 and one line, Ctrl-C in 130; warnings are lines, too."""
+    """Wrap a command: known errors give exit code 1 and one line, Ctrl-C 130; warnings are printed as lines."""
 
     @functools.wraps(command)
     def guarded(*args: P.args, **kwargs: P.kwargs) -> None:
@@ -30,13 +30,13 @@ def guard(command: Callable[P, None]) -> Callable[P, None]:
                 else:
                     warnings.simplefilter("ignore")
                 load_plugins()
-                if PROCESS.asked:  # while a plugin was imported, which is then said to be broken
+                if PROCESS.asked:  # during the import of a plugin, which is then reported as broken
                     raise KeyboardInterrupt
                 command(*args, **kwargs)
             if sys.stdout is not None:  # a process may be started without one
                 sys.stdout.flush()
         except BrokenPipeError:
-            # The reader of a pipe has gone (``groma ... | head``). Nothing more can be said to it.
+            # The reader of the pipe has ended (``groma ... | head``).
             sys.stdout = None  # type: ignore[assignment]
             raise typer.Exit(1) from None
         except (typer.Exit, typer.BadParameter):
@@ -54,7 +54,7 @@ def guard(command: Callable[P, None]) -> Callable[P, None]:
 
 
 def _explain(error: Exception) -> None:
-    """End with a line for an error that is known."""
+    """Exit with one line if the error is a known one."""
     if isinstance(error, GromaError):
         _fail(str(error), 1)
     if isinstance(error, OSError):
@@ -65,7 +65,7 @@ def _explain(error: Exception) -> None:
 
 
 def _show(message: Warning | str, category: type[Warning], *_where: object) -> None:
-    """Print a warning for the user as one line; others are for developers and stay silent."""
+    """Print warnings for the user as one line; those for developers are dropped."""
     if category is UserWarning:
         warn(str(message))
 
@@ -73,6 +73,6 @@ def _show(message: Warning | str, category: type[Warning], *_where: object) -> N
 def _fail(message: str, code: int) -> None:
     from groma.solver.reduce.mpi import started_as
 
-    if started_as()[0] == 0:  # of processes that mpiexec started together, the first speaks
+    if started_as()[0] == 0:  # of the ranks of MPI only the first prints
         complain("groma:", " ".join(message.split()), "red")
     raise typer.Exit(code) from None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What is wrong with an input at first sight: said before the libraries that would read it are loaded."""
+"""Checks of inputs and options before any library is loaded."""
 
 from pathlib import Path
 
@@ -7,20 +7,20 @@ from groma.errors import InputError
 
 
 def whole_scene(source: Path) -> Path:
-    """Return the archive in the folder of a map or track (it holds more than the COLMAP model there), or the source."""
+    """Return the archive in the folder of a map or track, which holds more than the model there; else the source."""
     archive = source / "scene.npz"
     return archive if archive.is_file() and (source / "summary.json").is_file() else source
 
 
 def refuse_idle(*options: tuple[str, bool, str]) -> None:
-    """Refuse options that would do nothing: each with whether it was given in vain, and what it acts with."""
+    """Refuse options without effect: (option, whether it has none, what it needs)."""
     for option, in_vain, others in options:
         if in_vain:
             raise InputError(f"{option} acts only {others}. Leave it out.")
 
 
 def camera_parameters(text: str | None) -> tuple[float, ...] | None:
-    """Return the numbers of --camera-params, which have commas between them."""
+    """Return the numbers of --camera-params, separated by commas."""
     if text is None:
         return None
     try:
@@ -38,7 +38,7 @@ def camera_line(model: str | None, params: str | None) -> str | None:
 
 
 def check_inputs(*paths: Path | None) -> None:
-    """Refuse places where there is nothing; None stands for an input that was not given."""
+    """Refuse paths that do not exist; None: not given."""
     for path in paths:
         if path is None:
             continue

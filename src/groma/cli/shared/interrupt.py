@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Ctrl-C and a polite request to end (SIGTERM), from the first moment of a command to its last.
+"""Ctrl-C and SIGTERM during a command.
 
-A signal that arrives while a package is imported or a compiler calls back into Python is swallowed, or comes out as
-an error of the package or the compiler. What was asked for is therefore remembered, and looked up when an error comes,
-and at the next progress.
+A signal that arrives while a package is imported, or while a compiler calls back into Python, is swallowed, or turns
+into an error of the package or the compiler. The request is therefore recorded, and checked when an error is caught and
+at the next progress.
 """
 
 import signal
@@ -22,15 +22,15 @@ INTERRUPTED = 130
 
 
 class Interruption:
-    """Whether the user asked to stop."""
+    """Whether an interrupt was requested."""
 
     def __init__(self) -> None:
         self.asked = False
-        #: Whether the user was told that the command ends.
+        #: Whether the interruption was reported.
         self.told = False
 
     def handle(self, number: int, frame: FrameType | None) -> None:
-        """Remember a signal, and interrupt."""
+        """Record a signal and interrupt."""
         self.asked = True
         raise KeyboardInterrupt
 
@@ -45,14 +45,14 @@ class Interruption:
         return checked
 
     def tell(self, words: str = "nothing is left half written.") -> int:
-        """Say once that the command was interrupted, and return its exit code."""
+        """Report the interruption once, and return the exit code."""
         if not self.told:
             self.told = True
             print(f"groma: interrupted; {words}", file=sys.stderr, flush=True)
         return INTERRUPTED
 
     def explains(self, error: BaseException) -> bool:
-        """Whether an error may be what an interrupt became on its way: any but a plain one of groma or the system."""
+        """Whether an error may be due to an interrupt: any but one of groma alone or of the system."""
         if not self.asked:
             return False
         from groma.errors import causes_of
@@ -61,38 +61,38 @@ class Interruption:
         return kinds != {"groma"} and not isinstance(error, OSError)
 
 
-#: Of the process, from the start of the command line on.
+#: That of the process.
 PROCESS = Interruption()
 
 
 def answer_signals() -> None:
-    """Let Ctrl-C and SIGTERM interrupt the process from now on; those that it was told to ignore it ignores."""
+    """Handle Ctrl-C and SIGTERM from now on, unless the process was started with them ignored."""
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
             signal.signal(number, _end_process)
 
 
 def ignore_signals() -> None:
-    """Let nothing interrupt what is left: the command is done, and Python tidies up."""
+    """Ignore signals from now on: the command is done, the interpreter finalises."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
 
 
 def _end_process(number: int, frame: FrameType | None) -> None:
-    # Objects of libraries that were interrupted while they were made complain when they are thrown away.
+    # Objects whose construction was interrupted may fail in their finaliser.
     sys.unraisablehook = lambda unraisable: None
     PROCESS.handle(number, frame)
 
 
 @contextmanager
 def interruptible() -> Iterator[Interruption]:
-    """Turn Ctrl-C and SIGTERM inside the block into KeyboardInterrupt, whatever they become on their way."""
+    """Turn Ctrl-C and SIGTERM inside the block into KeyboardInterrupt, also if a library turns them into its errors."""
     state = Interruption()
     mine = threading.current_thread() is threading.main_thread()
     before = {number: signal.signal(number, state.handle) for number in (signal.SIGINT, signal.SIGTERM) if mine}
     try:
         yield state
-    except Exception:  # of any kind: what an interrupt becomes on its way is up to the library that was interrupted
+    except Exception:  # of any kind: libraries turn an interrupt into errors of their own
         if state.asked:
             raise KeyboardInterrupt from None
         raise
@@ -103,7 +103,7 @@ def interruptible() -> Iterator[Interruption]:
 
 @contextmanager
 def stages_that_are_kept(console: "Console", words: str) -> Iterator[Callable[[str, int, int], None]]:
-    """Yield the progress of stages; Ctrl-C ends the command, and says with some words what is kept of them."""
+    """Yield the progress of stages; Ctrl-C ends the command with a message about what is kept."""
     import typer
 
     try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Mapping with everything that a terminal adds: progress, Ctrl-C, going on from finished stages, words at the end."""
+"""Mapping on the command line: progress, Ctrl-C, resuming from finished stages, summary."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from groma.mapping.result import MapResult
     from groma.scene import Scene
 
-#: The last stage as it is said.
+#: Name of the last stage.
 WRITING = "writing the results"
 
 
@@ -72,7 +72,7 @@ def stages_of_map(
 
 
 def write_map(console: Console, result: MapResult, output: Path, work: Path, force: bool, **how: Any) -> None:
-    """Write the folder of results and remove the finished stages; ``how`` goes to :meth:`MapResult.write`."""
+    """Write the folder of results and remove the finished stages; ``how`` is passed to :meth:`MapResult.write`."""
     from groma.mapping.checkpoints import remove_stages, system_reason
 
     try:
@@ -89,9 +89,9 @@ def write_map(console: Console, result: MapResult, output: Path, work: Path, for
 
 
 def say_map(console: Console, result: MapResult, numbers: dict[str, Any], explain: bool = True) -> None:
-    """Say what a map holds, how well it fits, what the data do not determine, and what became of the segments.
+    """Print the content of a map, its fit, the diagnosis, and the outcome of the segments.
 
-    Without ``explain`` the last two are said only with --verbose.
+    Without ``explain`` the last two are printed with --verbose only.
     """
     from groma.cli.shared.diagnosis import say_diagnosis
     from groma.cli.shared.sentences import (

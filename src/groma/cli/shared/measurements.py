@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from groma.cli.shared.console import Console
 
 PANEL = Panel("Measurements")
-#: Residuals so many times as large as stated are told.
+#: Ratio of residuals to stated deviations above which a warning is printed.
 WORSE = 2.0
 #: Suspect measurements that are named.
 _LISTED = 5
@@ -49,7 +49,7 @@ Crs = Annotated[
 
 @dataclass(frozen=True)
 class Measured:
-    """The options of :data:`PANEL`, which a command takes as one parameter, and what they were given."""
+    """The options under :data:`PANEL`, one parameter of a command, with their values."""
 
     positions: Positions = None
     position_sigma: Annotated[
@@ -128,7 +128,7 @@ class Measured:
     ] = False
 
     def validate(self) -> None:
-        """Refuse options that nothing is given for."""
+        """Refuse options without the measurements that they apply to."""
         needs = {
             "--position-sigma": (self.position_sigma, self.positions, "--positions"),
             "--control-sigma": (self.control_sigma, self.control, "--control"),
@@ -146,7 +146,7 @@ class Measured:
 
     @property
     def files(self) -> tuple[Path | None, ...]:
-        """Files that must be there."""
+        """Files that must exist."""
         positions = None if self.positions is None or _exif(self.positions) is not None else Path(self.positions)
         return positions, self.control, self.distances, self.directions, self.known_planes, self.poses
 
@@ -170,7 +170,7 @@ class Measured:
         images : Path, optional
             Folder of the photographs, for ``--positions exif``.
         names : callable
-            Gives their names in it, or those of the images of the scene.
+            Returns their names in it, or those of the images of the scene.
         """
         from groma.adjustment.survey.given import Survey
         from groma.io import survey as files
@@ -240,7 +240,7 @@ def _sigma(text: str | None, option: str, count: tuple[int, int] = (1, 3)) -> tu
 
 
 def say_survey(console: Console, numbers: dict[str, Any]) -> None:
-    """Say how the scene got into its frame, how the measurements fit, and which do not agree with the rest."""
+    """Print how the scene was placed in its frame, how the measurements fit, and which contradict the rest."""
     for sentence in numbers.get("notes", ()):
         console.say(sentence)
     shown = [
@@ -267,7 +267,7 @@ def say_survey(console: Console, numbers: dict[str, Any]) -> None:
 
 
 def _warn_of(console: Console, what: str, measurements: Sequence[Mapping[str, Any]], advice: str) -> None:
-    """Name the worst measurements, the worst first."""
+    """Warn of measurements, worst first."""
     for one in measurements[:_LISTED]:
         unit = " degrees" if "turn" in one["coordinate"] else _UNITS.get(one["kind"], "")
         console.warn(

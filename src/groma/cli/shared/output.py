@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Writing results: complete or not at all, and never over something that was there unless asked to."""
+"""Writing results: atomically, and never over an existing file without --force."""
 
 import re
 import tempfile
@@ -10,29 +10,29 @@ from pathlib import Path
 from groma.bounded.json_text import json_text
 from groma.errors import OutputError
 
-#: What the commands write into folders. A folder that holds anything else is not replaced by ``--force``.
+#: Files that commands write into folders. A folder with any other file is not replaced by ``--force``.
 _RESULTS = re.compile(
     r"(cameras|images|points3D|rigs|frames)\.(bin|txt)|structures|(scene|start|truth)\.npz|(lines|planes)\.(ply|obj)|"
     r"summary\.json|adjustment\.txt|report\.html|trajectory\.txt|poses\.txt|localized\.json|(submap|part)_\d+"
 )
 
-#: What a running track keeps (:mod:`groma.tracking.journal`).
+#: Files that a running track keeps (:mod:`groma.tracking.journal`).
 _JOURNAL = {"frames.txt", "keyframes.txt", "statuses.txt", "trajectory.txt", "scene.npz", "now.npz", "now.draft"}
 
 
 def check_outputs(
     force: bool, output: Path | None, *files: Path | None, json_target: str | None = None, file: bool = False
 ) -> None:
-    """Refuse early, before any work is done, places that cannot be written, or that are given twice.
+    """Refuse, before any work, outputs that cannot be written, or that are given twice.
 
     Parameters
     ----------
     force : bool
-        What is there may be replaced.
+        Replace existing files.
     output : Path, optional
-        Where the result goes, a file or a folder.
+        The result, a file or a folder.
     files : Path or None
-        Further results, which are files; None for those that are not wanted.
+        Further results, which are files; None: not requested.
     json_target : str, optional
         Value of --json.
     file : bool
@@ -50,14 +50,14 @@ def check_outputs(
 
 
 def check_output(path: Path, force: bool, file: bool = False) -> None:
-    """Refuse early, before any work is done, what :func:`atomic_output` would refuse at the end.
+    """Refuse, before any work, what :func:`atomic_output` would refuse at the end.
 
     Parameters
     ----------
     path : Path
-        Where a result goes.
+        The result.
     force : bool
-        What is there may be replaced, if groma wrote it.
+        Replace it if it exists and groma wrote it.
     file : bool
         The result is a file: it never replaces a folder.
     """
@@ -92,12 +92,12 @@ def check_output(path: Path, force: bool, file: bool = False) -> None:
 
 
 def work_folder(output: Path, ending: str = ".work") -> Path:
-    """Return the folder beside a result in which finished work is kept, which is removed at the end.
+    """Return the folder of checkpoints beside a result, which is removed at the end.
 
     Raises
     ------
     OutputError
-        If it holds anything and is none that groma made.
+        If it holds files that groma did not write.
     """
     folder = output.with_name(output.name + ending)
     names = {entry.name for entry in folder.iterdir()} if folder.is_dir() else set()
@@ -112,9 +112,9 @@ def work_folder(output: Path, ending: str = ".work") -> Path:
 
 @contextmanager
 def atomic_output(path: Path, force: bool, workshop_in: Path | None = None) -> Iterator[Path]:
-    """Yield a place to write a file or folder to; it becomes ``path`` when the block ends well, else it vanishes.
+    """Yield a draft to write a file or folder to; it is renamed to ``path`` at the end, or removed after an error.
 
-    It is built in ``workshop_in`` (default: beside ``path``).
+    It is in ``workshop_in`` (default: beside ``path``).
     """
     from groma.io.atomic import atomic_output as complete_or_not_at_all
 
@@ -124,13 +124,13 @@ def atomic_output(path: Path, force: bool, workshop_in: Path | None = None) -> I
 
 
 def check_json(target: str | None, force: bool) -> None:
-    """Refuse a report that could not be written, before any work is done."""
+    """Refuse, before any work, a report that could not be written."""
     if target not in (None, "-"):
         check_output(Path(target), force, file=True)
 
 
 def write_json(target: str | None, content: dict[str, object], force: bool = False) -> None:
-    """Write ``content`` to the file ``target``, to standard output when it is '-', nowhere when it is None."""
+    """Write ``content`` to the file ``target``, to standard output if it is '-', not at all if it is None."""
     if target is None:
         return
     text = json_text(content)

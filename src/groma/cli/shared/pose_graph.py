@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""``groma adjust`` of a pose graph in a file of g2o."""
+"""``groma adjust`` of a pose graph (g2o)."""
 
 from pathlib import Path
 from typing import Any
@@ -13,20 +13,20 @@ from groma.errors import InputError
 def adjust_graph_and_write(
     source: Path, output: Path | None, console: Console, force: bool, options: dict[str, Any], refused: dict[str, Any]
 ) -> dict[str, Any]:
-    """Adjust a pose graph, write it, say how it went and return the numbers.
+    """Adjust a pose graph, write it, print a summary and return the numbers.
 
     Parameters
     ----------
     source, output : Path
         Files of g2o; without ``output`` nothing is written.
     console : Console
-        Where to speak.
+        Prints the summary.
     force : bool
-        Replace what is there.
+        Replace an existing file.
     options : dict
         Fields of :class:`groma.adjustment.graphs.pose_graph.PoseGraphOptions` that were chosen.
     refused : dict
-        Options of the command that mean nothing for a pose graph, and their values.
+        Options that do not apply to pose graphs, with their values.
     """
     for name, value in refused.items():
         if value:

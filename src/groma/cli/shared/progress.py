@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What goes on, on standard error: one line that rewrites itself on a terminal, one now and then elsewhere."""
+"""Progress on standard error: a line that is rewritten on a terminal, a line every ten seconds elsewhere."""
 
 import sys
 import time
@@ -9,18 +9,15 @@ from typing import Any, Self
 
 from groma.cli.shared.style import can_rewrite, has_colours, paint, terminal_width
 
-#: Seconds between two lines where progress cannot rewrite itself, and characters of a full bar and of a short one.
+#: Seconds between two lines where lines cannot be rewritten; characters of a full bar and of the shortest.
 PAUSE, BAR, SHORT_BAR = 10.0, 20, 6
-#: Seconds of a stage before it is told how long it still takes.
+#: Seconds of a stage before its remaining time is shown.
 _EARLY = 1.0
 _ERASE = "\r\x1b[K"
 
 
 class Line:
-    """One line on a terminal, which vanishes at the end.
-
-    In a pipe, in a file and where TERM is dumb, one every ten seconds.
-    """
+    """One line on a terminal, erased at the end; a line every ten seconds in a pipe, a file or a dumb terminal."""
 
     def __init__(self, quiet: bool) -> None:
         self._rewrites = not quiet and can_rewrite(sys.stderr)
@@ -50,7 +47,7 @@ class Line:
 
 
 class Progress(Line):
-    """Call it with the progress events of an adjustment."""
+    """A callback for the progress events of an adjustment."""
 
     def __call__(self, event: Any) -> None:
         """Show one event: iteration, limit and cost."""
@@ -58,7 +55,7 @@ class Progress(Line):
 
 
 class Plan:
-    """The stages that are to come, by name; a name may come twice, and stages may be gone through again."""
+    """The declared stages by name; a name may occur twice, and stages may be repeated."""
 
     def __init__(self, names: Sequence[str] = ()) -> None:
         self.names = tuple(names)
@@ -66,7 +63,7 @@ class Plan:
         self._round = 1
 
     def label(self, name: str) -> str:
-        """Return for example ``stage 3 of 12: finding segments`` for the stage that begins; its name if not planned."""
+        """Return for example ``stage 3 of 12: finding segments`` for a new stage; only its name if undeclared."""
         later = [place for place, other in enumerate(self.names) if other == name]
         if not later:
             return name
@@ -81,7 +78,7 @@ class Plan:
 
 
 class Stages(Line):
-    """Call it with the name of a stage, what is done and what there is to do."""
+    """A callback for stages: name, number of parts done and in total."""
 
     def __init__(self, quiet: bool, plan: Plan, finished: Callable[[str], None] | None = None) -> None:
         super().__init__(quiet)
@@ -89,7 +86,7 @@ class Stages(Line):
         self._finished = finished
         self._stage = self._label = ""
         self._since = time.perf_counter()
-        #: From when on, and from how many parts on, the time that is left is estimated.
+        #: Start time and number of parts from which the remaining time is estimated.
         self._from = self._since, 0
         self._compiled = _functions_compiled()
 
@@ -101,7 +98,7 @@ class Stages(Line):
             self._stage, self._label = stage, self._plan.label(stage)
             self._from = self._since, done
         elif compiled != self._compiled or done < self._from[1]:
-            # What was compiled is there for the parts that are left: they are counted from here on.
+            # Compilation does not recur: estimate the remaining time from here on.
             self._from = time.perf_counter(), done
         self._compiled = compiled
         begin, first = self._from
@@ -126,9 +123,9 @@ class Stages(Line):
 
 
 def parts_done(stage: str, done: int, total: int, seconds: float, first: int = 0) -> str:
-    """Return how far a stage is, in words; nothing if it has no parts. ``seconds`` went into those after ``first``.
+    """Return the progress of a stage in words; empty without parts. The parts after ``first`` took ``seconds``.
 
-    An adjustment ends when it has converged, so its steps tell nothing about the time that is left.
+    The steps of an adjustment, which ends at convergence, give no remaining time.
     """
     if _has_steps(stage):
         return f"step {done} of at most {total}" if done else ""
@@ -139,7 +136,7 @@ def parts_done(stage: str, done: int, total: int, seconds: float, first: int = 0
 
 
 def _functions_compiled() -> tuple[int, ...]:
-    """Return numbers that change when this process compiles a function, or waits for another that does."""
+    """Return counts that change when this process compiles a function or waits for another process to do so."""
     cache = sys.modules.get("groma._kernels.cache")
     return () if cache is None else (cache.counts.missed, cache.counts.compiled, cache.counts.unsaved)
 
@@ -149,7 +146,7 @@ def _has_steps(stage: str) -> bool:
 
 
 def screen_line(head: str, parts: str, share: float | None, width: int) -> str:
-    """Return a line that fits the terminal: what goes on, a bar where there is room, and how far it is."""
+    """Return a line that fits the terminal: the stage, a bar if there is room, and the progress."""
     room = width - 1
     bar = min(BAR, room - len(f"  {head}  []  {parts}")) if share is not None else 0
     if bar < SHORT_BAR or share is None:
@@ -170,7 +167,7 @@ def _can_say(text: str) -> bool:
 
 
 def say_seconds(seconds: float) -> str:
-    """Return a length of time in two units at most: ``40 s``, ``2 min 5 s``, ``3 h 10 min``."""
+    """Return a duration in at most two units: ``40 s``, ``2 min 5 s``, ``3 h 10 min``."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"

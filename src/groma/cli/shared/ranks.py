@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Processes that mpiexec started together, as workers of one command that the first of them, rank 0, goes through."""
+"""Ranks of MPI as workers of a command that rank 0 runs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ P = ParamSpec("P")
 
 
 def led_by_first_rank(command: Callable[P, None]) -> Callable[P, None]:
-    """Wrap a command: of ranks only the first goes through it, and the others do what it gives them."""
+    """Wrap a command: rank 0 runs it, the others execute the tasks that it submits."""
 
     @functools.wraps(command)
     def led(*args: P.args, **kwargs: P.kwargs) -> None:
@@ -27,10 +27,10 @@ def led_by_first_rank(command: Callable[P, None]) -> Callable[P, None]:
 
 @contextmanager
 def ranks_as_workers() -> Iterator[bool]:
-    """Yield whether this process leads: one that was started alone does, and of ranks the first.
+    """Yield whether this process runs the command: a single process, or rank 0.
 
-    Independent pieces of its work (:mod:`groma.execution`) then go to all ranks. The others serve it, and are told that
-    they do not lead when it is done.
+    Its independent tasks (:mod:`groma.execution`) are distributed to all ranks. For the others the block is entered,
+    with False, when rank 0 is done.
 
     Raises
     ------
@@ -53,7 +53,7 @@ def ranks_as_workers() -> Iterator[bool]:
 
 
 class _Everyone(Executor):
-    """An executor that gives a piece of work to who has the least to do: the other ranks, or a thread of this one."""
+    """An executor that submits a task to the other ranks, or to a thread of this one, whichever has fewer waiting."""
 
     def __init__(self, others: Executor, own: Executor, num_others: int) -> None:
         self._others, self._own, self._num_others = others, own, num_others

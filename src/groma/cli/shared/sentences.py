@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from groma.cli.shared.console import Console
     from groma.compilation.time import Compilation
 
-#: What a scene holds, in the order in which it is said.
+#: Content of a scene, in the order of the table.
 KINDS = ("images", "points", "lines", "planes", "directions")
 #: Header and rows.
 Table = tuple[tuple[str, ...], list[list[str]]]
@@ -30,7 +30,7 @@ _GAUGES = {
     "held": "the first camera and the scale",
     "measured": "the measurements",
 }
-#: Of how much of the calibration the deviations know nothing.
+#: How much of the calibration the standard deviations take as exact.
 _EXACT = {
     "all": "; the calibration counts as exact",
     "part": "; what is held of the calibration counts as exact",
@@ -43,12 +43,12 @@ _NO_STAGES = ("total", "compilation")
 def say_adjustment(
     console: Console, numbers: Mapping[str, Any], sentence: str, compilation: Compilation | None = None
 ) -> None:
-    """Say what a reader wants to know after an adjustment, most important first.
+    """Print the summary of an adjustment, most important first.
 
     Parameters
     ----------
     console : Console
-        Where; with --verbose also the relations between landmarks and the seconds per stage.
+        With --verbose also relations between landmarks and seconds per stage.
     numbers : mapping
         The report as a dictionary (the content of ``--json``).
     sentence : str
@@ -76,7 +76,7 @@ def say_adjustment(
 
 
 def fit_table(counts: Mapping[str, int], found: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Return header and rows: of everything how much there is, and of landmarks how well they fit, before and after.
+    """Return header and rows: the number of each kind, and the fit of landmarks, before and after.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def describe_pose_uncertainty(numbers: Mapping[str, Any] | None) -> list[str]:
 
 
 def describe_structure(relations: Mapping[str, int]) -> list[str]:
-    """Return how many angles are right, and at how many places lines meet; ``relations`` is ``num_relations``."""
+    """Return the numbers of parallel and right angles and of meeting lines; ``relations`` is ``num_relations``."""
     parallel = ("parallel_planes", "parallel_directions", "plane_across_direction")
     right = ("perpendicular_planes", "perpendicular_directions", "plane_along_direction")
     parts = [
@@ -131,7 +131,7 @@ def describe_structure(relations: Mapping[str, int]) -> list[str]:
 
 
 def describe_relations(relations: Mapping[str, Mapping[str, int]]) -> list[str]:
-    """Return how many relations between landmarks of each kind hold, and how many the robust loss gave up."""
+    """Return how many relations of each kind were kept, and how many the robust loss rejected."""
     return [
         f"  {name.replace('_', ' ')}: {outcome['held']:,} kept, {outcome['dropped']:,} rejected"
         for name, outcome in relations.items()
@@ -155,7 +155,7 @@ def describe_uncertainty(numbers: Mapping[str, Any]) -> list[str]:
 
 
 def say_contributions(console: Console, entries: Sequence[Mapping[str, Any]]) -> None:
-    """Say what each kind of landmark changes, points alone first; the entries are those of ``--json``."""
+    """Print what each kind of landmark changes, points alone first; the entries are those of ``--json``."""
     if not entries:
         return
     kinds = list(dict.fromkeys(kind for entry in entries for kind in entry["rmse_px"]))
@@ -188,12 +188,12 @@ def spent(total: float, compilation: float, compiled: bool) -> str:
     Parameters
     ----------
     total, compilation : float
-        Seconds of the work as a whole, and those of them that went into compiled code.
+        Seconds in total, and those of compiling or loading code.
     compiled : bool
         Whether it was compiled, and not only loaded.
     """
     why = "compile" if compiled else "load compiled code"
-    if compilation >= max(total, 0.005):  # reading is part of it: what is left for the work itself is not known
+    if compilation >= max(total, 0.005):  # reading counts, too: the time of the work itself is unknown
         return f"{compilation:.2f} s, nearly all to {why}"
     return f"{max(total - compilation, 0.0):.2f} s" + (
         f", and {compilation:.2f} s to {why}" if compilation >= 0.005 else ""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How text looks: colours where a terminal shows them and they are wanted, tables, lines as wide as the screen."""
+"""Text on a terminal: colours, tables, wrapped lines."""
 
 import os
 import re
@@ -17,32 +17,32 @@ _MOST_LINES = 3
 
 
 def is_terminal(stream: TextIO | None) -> bool:
-    """Tell whether somebody looks at a stream."""
+    """Whether a stream is a terminal."""
     return stream is not None and stream.isatty()
 
 
 def can_rewrite(stream: TextIO | None) -> bool:
-    """Tell whether a line of a stream can be written anew: a terminal, unless TERM is dumb."""
+    """Whether lines of a stream can be rewritten: a terminal, unless TERM is dumb."""
     return is_terminal(stream) and os.environ.get("TERM") != "dumb"
 
 
 def has_colours(stream: TextIO | None) -> bool:
-    """Tell whether a stream shows colours: a terminal, unless NO_COLOR is set or TERM is dumb."""
+    """Whether a stream shows colours: a terminal, unless NO_COLOR is set or TERM is dumb."""
     return can_rewrite(stream) and not os.environ.get("NO_COLOR")
 
 
 def paint(text: str, style: Style, stream: TextIO | None) -> str:
-    """Return the text in a style, or as it is where the stream shows none."""
+    """Return the text in a style; unchanged if the stream shows no colours."""
     return f"\x1b[{_CODES[style]}m{text}\x1b[0m" if text and has_colours(stream) else text
 
 
 def terminal_width() -> int:
-    """Return how many characters a line of the terminal holds."""
+    """Return the number of columns of the terminal."""
     return shutil.get_terminal_size().columns
 
 
 def wrapped(text: str, width: int) -> str:
-    """Return the text with its lines broken between words; what follows a break stands deeper than its line."""
+    """Return the text wrapped between words, continuation lines indented."""
     lines = []
     for line in text.split("\n"):
         indent = re.match(" *", line)[0]  # type: ignore[index]
@@ -55,10 +55,9 @@ def wrapped(text: str, width: int) -> str:
 def aligned(
     header: Sequence[str], rows: Sequence[Sequence[str]], width: int | None = None
 ) -> tuple[list[str], list[str]]:
-    """Return the lines of a table, those of its header apart: names to the left, numbers to the right.
+    """Return the header lines and the body lines of a table: first column left-aligned, the others right-aligned.
 
-    Columns in which no row has anything are left out. The header of a table wider than ``width`` is broken between
-    words, into as few lines as make it fit.
+    Empty columns are left out. The header of a table wider than ``width`` is wrapped into as few lines as make it fit.
     """
     shown = [column for column in range(len(header)) if column == 0 or any(row[column] for row in rows)]
     cells = [[row[column] for column in shown] for row in rows]
@@ -79,7 +78,7 @@ def aligned(
 
 
 def _broken(head: str, room: int, height: int) -> list[str]:
-    """Return the words of a column's head in so many lines, the first ones empty, no wider than need be."""
+    """Return the head of a column in ``height`` lines, as narrow as possible, padded with empty lines at the top."""
     lines = [head]
     for width in range(max(room, 1), len(head) + 1):
         lines = textwrap.wrap(head, width, break_long_words=False, break_on_hyphens=False)

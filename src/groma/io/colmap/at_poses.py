@@ -2,7 +2,7 @@
 """Points of photographs whose poses are known more or less, by pycolmap: matches, two-view geometries, triangulation.
 
 Features and matches do not depend on the poses, except for which pairs of many images are matched. They are kept in a
-database as :mod:`groma.io.colmap.sfm` does it, and what is finished there is not done again.
+database as in :mod:`groma.io.colmap.sfm`, and finished work is not repeated.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ MIN_MATCHES = 15
 
 @dataclass(frozen=True, eq=False)
 class MatchedPair:
-    """Two images, the places that match in them, and the motion between them that the matches tell."""
+    """Two images, their matches, and the relative pose estimated from them."""
 
     #: Rows of the images.
     first: int

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Calibrations of photographs that no file holds: what EXIF tells, or the usual guess."""
+"""Initial calibrations of photographs, from EXIF or by a default."""
 
 from __future__ import annotations
 

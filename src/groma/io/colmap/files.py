@@ -147,7 +147,7 @@ def points_within(data: bytes | bytearray) -> dict[int, np.ndarray]:
 
 
 def check_text_rows(folder: Path, counts: Mapping[str, int]) -> None:
-    """Raise when a text file of a model has not so many lines, apart from comments, each with an end."""
+    """Raise unless the text files of a model have the given numbers of complete lines, comments aside."""
     for name, count in counts.items():
         content = (folder / name).read_bytes()
         found = sum(not line.startswith(b"#") for line in content.split(b"\n")[:-1])
@@ -156,9 +156,9 @@ def check_text_rows(folder: Path, counts: Mapping[str, int]) -> None:
 
 
 def damage_in_text(folder: Path) -> str:
-    """Return where the text files of a model are damaged, in words, or "" where their rows look as they should.
+    """Return the place of a malformed row in the text files of a model, in words; "" if there is none.
 
-    COLMAP's own reader names neither the file nor the line. Rows are only looked at, not interpreted.
+    COLMAP's own reader names neither the file nor the line. Only the form of rows is checked.
     """
     rows = {
         "cameras.txt": lambda words: len(words) >= 4 and _numbers(words[:1] + words[2:]),
@@ -189,7 +189,7 @@ def _numbers(words: list[str]) -> bool:
 
 
 def _count(data: bytes, least_row: int) -> int:
-    """Return the count at the start, refused when the file could not hold so many rows."""
+    """Return the count at the start; ValueError if the file is too short for it."""
     count = int(_COUNT.unpack_from(data)[0])
     if count * least_row > len(data):
         raise ValueError(f"it promises {count} entries in {len(data)} bytes")

@@ -29,9 +29,9 @@ def features_of_large(pycolmap: Any, database: Path, images: Path, names: Sequen
     images : Path
         Folder of the photographs.
     names : sequence of str
-        Of those that are looked at.
+        Names of the images.
     extraction : pycolmap.FeatureExtractionOptions
-        As for all photographs; it comes back as it was.
+        As for all photographs; changed temporarily.
     """
     content = pycolmap.Database.open(str(database))
     entered = {name: content.read_image_with_name(name) for name in names}

@@ -94,7 +94,7 @@ def map_globally(task: Task, say: Say) -> list[Any]:
     return [found[number] for number in sorted(found)]
 
 
-#: By the name that a user says.
+#: Mappers by name.
 MAPPERS: dict[str, Callable[[Task, Say], list[Any]]] = {"incremental": map_incrementally, "global": map_globally}
 
 

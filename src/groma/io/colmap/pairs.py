@@ -56,7 +56,7 @@ def blocks_of_pairs(
     places : (count, 3), optional
         Where they were taken; NaN where unknown.
     axes : (count, 3), optional
-        Where they look: images that look away from each other are left out.
+        Optical axes: images that face away from each other are left out.
     """
     blocks = list(pair_blocks(count))
     if count <= EXHAUSTIVE_LIMIT or places is None:

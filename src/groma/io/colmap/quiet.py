@@ -10,7 +10,7 @@ from typing import Any
 
 @contextmanager
 def quiet(pycolmap: Any) -> Iterator[None]:
-    """Let pycolmap say nothing: what it reports comes back as one line of ours."""
+    """Silence the log of pycolmap; its errors are reported by groma."""
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     try:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Rigs of photographs, as COLMAP's ``rig_config.json`` describes them: which images were taken at the same moment.
 
-A camera of a rig has a prefix of image names; what follows it is the name of the moment, the frame. The file may say
-how each camera sits on its rig and what its calibration is. Where it does not say how one sits, images are mapped
-alone first, and its place is taken from there.
+A camera of a rig has a prefix of image names; the rest of a name identifies the frame. The file may hold the pose of
+each camera on its rig and its calibration. Where a pose is missing, the images are first mapped without rigs, and the
+pose is taken from that model.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ RIG_FILE = "rig_config.json"
 class RigCamera:
     """A camera of a rig."""
 
-    #: How the names of its images begin.
+    #: Prefix of the names of its images.
     prefix: str
     #: Whether its frame is that of the rig.
     is_reference: bool
@@ -50,7 +50,7 @@ class RigDescription:
 
     @property
     def is_posed(self) -> bool:
-        """Whether it is known how all cameras sit on the rig."""
+        """Whether the poses of all cameras on the rig are known."""
         return all(camera.cam_from_rig is not None for camera in self.cameras)
 
 
@@ -76,7 +76,7 @@ def read_rigs(path: str | os.PathLike[str]) -> tuple[RigDescription, ...]:
 
 
 def check_rigs(rigs: Sequence[RigDescription], names: Sequence[str]) -> str:
-    """Check that every camera of the rigs has images, and say in a sentence how many frames there are.
+    """Check that every camera of the rigs has images; return a sentence with the number of frames.
 
     Raises
     ------
@@ -109,7 +109,7 @@ def check_rigs(rigs: Sequence[RigDescription], names: Sequence[str]) -> str:
 
 
 def by_frames(rigs: Sequence[RigDescription], names: Sequence[str]) -> list[str]:
-    """Return the names with those of a frame beside each other, as neighbours by name are matched with each other."""
+    """Return the names sorted by frame, since neighbours in this order are matched."""
 
     def place(name: str) -> tuple[str, str]:
         found = _moment(rigs, name)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A first model of points and poses from photographs alone, by pycolmap: SIFT, matching, incremental mapping.
 
-Features and matches are kept in a database; what is finished there is not done again, and a run that was killed goes on
-in the middle of either. Work is handed to pycolmap in small batches, which is what progress, Ctrl-C and going on need.
+Features and matches are kept in a database, so that a killed run resumes in the middle of either. pycolmap gets small
+batches, for progress, Ctrl-C and resuming.
 
 The result does not depend on how threads take turns: images and cameras are entered in the order of their names before
 anything runs in parallel, and every source of random numbers is seeded.
@@ -56,11 +56,11 @@ class PointModelOptions:
     seed: int = 0
     #: Most threads of pycolmap; None: as many as there are processors.
     threads: int | None = None
-    #: What places the cameras: ``incremental``, one after the other, or ``global``, all at once.
+    #: Mapper: ``incremental`` or ``global``.
     mapper: str = "incremental"
     #: Which images were taken at the same moment by cameras fixed to each other; none: every image stands alone.
     rigs: tuple[RigDescription, ...] = ()
-    #: Estimate where the cameras sit on their rig; otherwise they stay where the description says.
+    #: Estimate the poses of the cameras on their rig; otherwise they are held.
     refine_rigs: bool = False
 
     def __post_init__(self) -> None:
@@ -114,13 +114,13 @@ def reconstruct_points(
     images : path
         Folder of photographs.
     work : path
-        Folder for the database; what is finished there is not done again.
+        Folder for the database; finished work in it is not repeated.
     names : sequence of str
         The images, by their names in the folder.
     options : PointModelOptions, optional
         Camera model, seed, threads.
     progress : callable, optional
-        Called with the name of a stage, what is done and what there is to do.
+        Called with the name of a stage, the number of parts done, and their total.
 
     Returns
     -------
@@ -187,7 +187,7 @@ def _most_linked(pycolmap: Any, content: Any) -> int:
 
 
 def _why_none(features: int, matches: int, count: int, linked: int) -> str:
-    """Say why nothing could be reconstructed."""
+    """Return the probable reason that nothing was reconstructed."""
     if features == 0:
         return "They show no texture."
     if matches < FEW_MATCHES * count:
@@ -204,13 +204,13 @@ def _why_none(features: int, matches: int, count: int, linked: int) -> str:
 
 
 def _enter_images(pycolmap: Any, database: Path, images: Path, names: list[str], options: PointModelOptions) -> None:
-    """Enter cameras and images, before features are found in parallel, so that their numbers are always the same."""
+    """Enter cameras and images in order, so that their identifiers do not depend on threads."""
     try:
         with _opened(pycolmap, database) as content:
             if content.num_images() == len(names):
                 return
             content.clear_all_tables()  # a run was killed here
-    except RuntimeError:  # damaged by somebody else: made again
+    except RuntimeError:  # damaged: start again
         for path in database.parent.glob(f"{database.name}*"):
             path.unlink()
         with _opened(pycolmap, database):
@@ -275,7 +275,7 @@ def _match(
     common = {"matching_options": matching, "verification_options": verification, "device": pycolmap.Device.cpu}
     total = sum(map(len, blocks))
     if any(name.split() != [name] for name in names):
-        # A list of pairs is cut at white space; these calls need none, but tell nothing before they end.
+        # Lists of pairs are split at white space; these calls need no list, but report no progress.
         say("matching points of image pairs", 0, total)
         _check_room(database.parent, total * _PAIR_ROOM)
         if len(names) <= EXHAUSTIVE_LIMIT:
@@ -310,14 +310,14 @@ def _opened(pycolmap: Any, database: Path) -> Iterator[Any]:
 
 
 def _check_room(folder: Path, more: int = 0) -> None:
-    """Refuse to begin what the disk may have no room for."""
+    """Raise OutputError if the disk may be too full."""
     free, needed = shutil.disk_usage(folder).free, _ROOM + more
     if free < needed:
         raise OutputError(
             f"The disk of {folder} has {free >> 20} MiB left; the points of the images need {-(-needed >> 20)} MiB. "
             "Make room there; the same command then goes on."
         )
-    if hasattr(os, "posix_fallocate"):  # knows of quotas and limits, too
+    if hasattr(os, "posix_fallocate"):  # respects quotas and limits
         with tempfile.TemporaryFile(dir=folder) as probe:
             try:
                 os.posix_fallocate(probe.fileno(), 0, needed)

@@ -54,7 +54,7 @@ def write_dxf(scene: Scene, path: str | os.PathLike[str], force: bool = False) -
 
 
 def check_dxf(scene: Scene) -> None:
-    """Raise InputError if there is nothing to draw, or what is drawn is not finite."""
+    """Raise InputError if there is nothing to draw, or if it is not finite."""
     if not (scene.num_points or scene.num_lines or scene.num_planes or scene.num_images):
         raise InputError("The scene has no points, lines, planes or images: there is nothing to draw.")
 

@@ -3,7 +3,7 @@
 
 Entities: ``world/points``, ``world/lines``, ``world/planes/ID``, and ``world/images/NAME`` with pose and pinhole, below
 it ``points`` and ``segments`` as measured. Numbers are in single precision, so the scene is shifted to its middle; the
-value ``shift`` of ``world`` says by how much. The package rerun-sdk writes the files; it is large, hence an extra.
+value ``shift`` of ``world`` holds the offset. The package rerun-sdk writes the files; it is large, hence an extra.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Scenes of text formats whose pixels count from the image centre and that do not say how large the images are.
+"""Scenes of text formats with pixels relative to the image centre and without image sizes.
 
 The size is read from the photographs where they lie beside the file. Where it is known, pixels count from the corner as
 everywhere here; else the camera has the model BAL or a principal point at (0, 0), and pixels count from the centre.
@@ -21,7 +21,7 @@ from groma.scene import PointObservations, Scene
 
 @dataclass(frozen=True, eq=False)
 class PointRows:
-    """Points with colours and the views of each, as a list of numbers has them one after the other."""
+    """Points with colours and the views of each, parsed from a list of numbers."""
 
     #: (P, 3) places, and (P, 3) colours from 0 to 255.
     xyz: FloatArray

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 r"""Reconstructions of VisualSFM: ``.nvm`` (N-View Match, version 3).
 
-After ``NVM_V3`` a file has models, one after the other: the number of cameras, for each ``name f qw qx qy qz`` and the
+After ``NVM_V3`` a file lists models: the number of cameras, for each ``name f qw qx qy qz`` and the
 camera centre, ``r 0``; the number of points, for each its place, its colour and its views ``n (image feature u v)``.
 A model with no cameras ends the list. Cameras look along z with y down, as ours. Pixels count from the image centre
 (:mod:`groma.io.interchange.centred`), or from the principal point after ``FixedK fx cx fy cy`` in the first line.
@@ -75,7 +75,7 @@ def read_nvm(path: str | os.PathLike[str]) -> Scene:
 
 
 def _model(lines: list[str], at: int, count: int, turn: int, path: Path) -> tuple[_Model, int]:
-    """Return the model whose cameras begin at a line, and the line after it."""
+    """Return the model whose cameras start at a line, and the line after it."""
     if at + count >= len(lines):
         raise FileFormatError(f"{path} promises {count} cameras, but ends before its points. Fetch or save it again.")
     names, numbers = [], []

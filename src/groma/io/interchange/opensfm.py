@@ -185,7 +185,7 @@ def _calibration(camera: dict[str, Any], place: str) -> Calibration:
 
 @dataclass(eq=False)
 class _Tracks:
-    """What one image sees: names of tracks, and x and y one after the other, normalised."""
+    """The observations of one image: names of tracks, and normalised x and y alternating."""
 
     names: list[str]
     places: list[float]

@@ -21,7 +21,7 @@ from groma.scene import Points
 _ROTATION_SLIP = 5e-3
 #: Coordinates beyond this are no places; their squares leave the number range.
 _LARGEST = 1e100
-#: Bytes of a photograph that are looked at for its size before the rest is (cost: time only).
+#: Bytes of a photograph that are searched for its size first (cost: time only).
 _HEADER_BYTES = 1 << 17
 
 

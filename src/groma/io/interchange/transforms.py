@@ -58,7 +58,7 @@ from groma.scene import Cameras, Points, Scene
 from groma.scene.checks import check_scene_given
 
 _NAME = "transforms.json"
-#: What a frame or the top of a file says about a camera.
+#: A camera, as given in a frame or at the top of a file.
 INTRINSICS = (
     "camera_model", "is_fisheye", "camera_angle_x", "camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h",
     "k1", "k2", "k3", "k4", "p1", "p2",
@@ -137,7 +137,7 @@ def _name(frame: dict[str, Any], place: str) -> str:
 def _calibrations(
     document: dict[str, Any], frames: list[dict[str, Any]], names: list[str], path: Path
 ) -> list[Calibration]:
-    """Return the camera of each frame: what the top of the document says, and the frame instead where it says it."""
+    """Return the camera of each frame: entries of the frame override those at the top of the document."""
     top = {name: document[name] for name in INTRINSICS if name in document}
     has_sizes = {"w", "h"} <= top.keys() or all({"w", "h"} <= frame.keys() for frame in frames)
     sizes = (size_of_image(path.parent, name) for name in ([] if has_sizes else names))
@@ -233,7 +233,7 @@ def write_transforms(
     Raises
     ------
     InputError
-        If a camera has a model that the file does not know, or no size.
+        If a camera has no size, or a model that transforms files do not support.
     """
     check_scene_given(scene)
     place = Path(path)
@@ -261,13 +261,13 @@ def write_transforms(
 
 
 def check_transforms(scene: Scene) -> None:
-    """Raise InputError if a camera has a model that a transforms file does not know, or no size."""
+    """Raise InputError if a camera has no size, or a model that transforms files do not support."""
     for row in np.unique(scene.images.camera_idx).tolist():
         _entries(scene.cameras, row)
 
 
 def _entries(cameras: Cameras, row: int) -> dict[str, Any]:
-    """Return what the file says about a camera."""
+    """Return the entries of a camera."""
     model, size = cameras.models[row], (int(cameras.width[row]), int(cameras.height[row]))
     if min(size) <= 0:
         raise InputError(

@@ -99,7 +99,7 @@ class Lines3d:
     segments: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 3)))
     #: (L,) uncertainty; -1 where unknown.
     uncertainty: FloatArray = no_rows(NUMBER)
-    #: (L + 1,) where tracks begin and end.
+    #: (L + 1,) bounds of the tracks.
     start: IntArray = field(default_factory=lambda: np.zeros(1, np.int64))
     #: Images and numbers of 2D lines.
     track: Records = no_rows(TRACK)

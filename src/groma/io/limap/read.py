@@ -69,7 +69,7 @@ class _Bytes:
         return value
 
     def count(self, least: int = 1) -> int:
-        """Return a count of rows of at least so many numbers, refused where the file could not hold them."""
+        """Return a count of rows of at least ``least`` numbers; refused if the file is too short for them."""
         return self.fits(self.one("Q"), 4 * least)
 
     def fits(self, count: int, size: int) -> int:

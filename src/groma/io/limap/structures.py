@@ -119,7 +119,7 @@ def structures_of(source: str | os.PathLike[str]) -> Structures | None:
 def write_limap(
     structures: Structures, path: str | os.PathLike[str], form: Form = "binary", force: bool = False
 ) -> None:
-    """Write structures as a new folder, which goes beside a COLMAP model under the name ``structures``."""
+    """Write structures as a new folder, named ``structures`` in the folder of a COLMAP model."""
     if form not in SUFFIX:
         raise InputError(f"form must be 'binary' or 'text'; got {form!r}.")
     with atomic_output(path, force) as draft:

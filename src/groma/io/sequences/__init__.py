@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Image sequences on disk: one layout per module; :func:`open_sequence` tells them apart."""
+"""Image sequences on disk: one layout per module, recognised by :func:`open_sequence`."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ def open_sequence(
         A folder of TUM RGB-D (``rgb.txt``), 7-Scenes (``frame-000000.color.png``), KITTI odometry (``image_0``) or
         EuRoC (``mav0``), a folder with ``rgb`` or ``color`` and ``depth``, a folder of images, or a video file.
     camera : SequenceCamera, numbers, str or path, optional
-        The camera that took the images, in place of what the folder says: ``fx fy cx cy [k1 k2 p1 p2 [k3]]`` as OpenCV
+        The camera, overriding that of the folder: ``fx fy cx cy [k1 k2 p1 p2 [k3]]`` as OpenCV
         counts (the first pixel's centre is (0, 0)), a line of COLMAP's ``cameras.txt`` (the first pixel's centre is
         (0.5, 0.5)), or a file that holds one of these or a 3x3 matrix. Distorted images are undistorted.
     depth_scale : float, optional
-        Depth in files per metre, in place of what the layout says (TUM 5000, 7-Scenes 1000).
+        Depth values per metre, overriding those of the layout (TUM 5000, 7-Scenes 1000).
     stride : int
         Give every n-th frame.
     max_frames : int, optional
-        Give at most so many.
+        Maximum number of frames.
     kind : str, optional
         ``mono`` leaves depth or right images out; other kinds must be what the files hold.
 

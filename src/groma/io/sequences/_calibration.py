@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Cameras of sequences: what a file or an option says, and the maps that take distortion away.
+"""Cameras of sequences, from a file or an option, and the maps that remove distortion.
 
 Files of calibrations count pixels from the centre of the first pixel, COLMAP from its corner; groma counts as COLMAP
 does. Half a pixel is therefore added to principal points, except those in lines of COLMAP.
@@ -45,7 +45,7 @@ class Calibration:
     model: str
     #: (k,) its parameters.
     params: FloatArray
-    #: (width, height) in pixels, or None if not said.
+    #: (width, height) in pixels; None: unknown.
     size: tuple[int, int] | None = None
 
     @property

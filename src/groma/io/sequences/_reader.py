@@ -45,7 +45,7 @@ class Selection:
 
     #: Every n-th frame.
     stride: int = 1
-    #: At most so many.
+    #: Maximum number of frames.
     max_frames: int | None = None
     #: Leave out what this kind does not hold.
     kind: Kind | None = None
@@ -167,7 +167,7 @@ class FileSequence:
 
 
 def read_ahead(load: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
-    """Yield ``load(item)`` in order, computed by another thread up to ``AHEAD`` items before they are asked for."""
+    """Yield ``load(item)`` in order, computed by another thread up to ``AHEAD`` items ahead."""
     with ThreadPoolExecutor(1, thread_name_prefix="groma-frames") as pool:
         waiting: deque[Future[Any]] = deque()
         try:

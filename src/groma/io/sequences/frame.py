@@ -86,7 +86,7 @@ def checked_params(model: str, params: npt.ArrayLike, source: str) -> FloatArray
 
 @runtime_checkable
 class Sequence(Protocol):
-    """Frames in order of time, read while they are asked for; never all in memory. May be iterated repeatedly."""
+    """Frames in temporal order, read on iteration, never all in memory. May be iterated repeatedly."""
 
     camera: SequenceCamera
     kind: Kind
@@ -94,7 +94,7 @@ class Sequence(Protocol):
     reference: Trajectory | None
     #: What was left out or repaired, in sentences; grows while frames are read.
     warnings: list[str]
-    #: Number of frames, or None where only reading tells (video); frames that cannot be read are skipped.
+    #: Number of frames, unreadable ones included; None: unknown before reading (video).
     num_frames: int | None
 
     def __iter__(self) -> Iterator[Frame]: ...

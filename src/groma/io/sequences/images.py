@@ -3,7 +3,7 @@
 
 Images are taken in order of the numbers in their names. Their times are the lines of ``times.txt`` if it is there, else
 the names, where all are numbers of seconds (with a decimal point) or nanoseconds (16 digits and more), else the count
-at 30 frames a second. A video says its own rate.
+at 30 frames a second. A video has its own rate.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from groma.io.sequences._reader import Entry, FileSequence, Selection, read_ahea
 from groma.io.sequences.frame import Frame, Kind, SequenceCamera
 from groma.io.trajectories import Trajectory, read_trajectory
 
-#: Frames a second where nothing says it (convention: usual for video).
+#: Default frame rate, 1/s (convention: usual for video).
 RATE = 30.0
 
 #: What to do where no camera is known.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The registry of sequence layouts: how each is told by what lies in a folder, and how it is opened."""
+"""The registry of sequence layouts: how each is recognised and opened."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from groma.io.sequences.frame import Sequence
 
 @dataclass(frozen=True)
 class Wishes:
-    """What the caller of :func:`groma.io.sequences.open_sequence` asked for."""
+    """Arguments of :func:`groma.io.sequences.open_sequence`."""
 
-    #: In place of what the folder says.
+    #: Overrides the camera of the folder.
     calibration: Calibration | None
-    #: Depth in files per metre, in place of what the layout says.
+    #: Depth values per metre, overriding those of the layout.
     depth_scale: float | None
     #: Which frames, and of what kind.
     selection: Selection
@@ -30,7 +30,7 @@ class SequenceLayout:
     """How sequences of one kind lie on disk."""
 
     name: str
-    #: What to look for, for messages: ``image_0 (KITTI)``.
+    #: Recognised files, for messages: ``image_0 (KITTI)``.
     sign: str
     #: Returns what to open (the path itself, or a folder in it) if a path has this layout; else None.
     find: Callable[[Path], Path | None]

@@ -120,7 +120,7 @@ def _list(path: Path) -> list[tuple[float, Path]]:
 
 
 def _listed(path: Path, number: int, words: list[str]) -> tuple[float, Path]:
-    """Return the time and the file that two words of a line say."""
+    """Return the time and the file in two words of a line."""
     place = f"{path}, line {number}"
     return finite(words[:1], place, "a finite time")[0], listed_file(path.parent, words[1], place)
 

@@ -2,7 +2,7 @@
 """Control points with their marks in the images.
 
 OpenDroneMap, ``gcp_list.txt``: the first line names the coordinate system (:mod:`groma.io.survey.coordinates`), each
-other line is one mark, ``x y z u v image`` and mostly a name. Points without a name are told apart by their
+other line is one mark, ``x y z u v image`` and mostly a name. Points without a name are identified by their
 coordinates. Also read: ``local`` as the system, and ``- - -`` for a point whose place was not measured. Pixel (0, 0) is
 the centre of the first pixel there, (0.5, 0.5) here.
 

@@ -84,7 +84,7 @@ class Places:
     names: tuple[str, ...]
     #: (N, 3) longitude, latitude (degrees) and height; or east, north and height.
     coordinates: FloatArray
-    #: (N, 3) standard deviations of east, north and height, in the unit of length; NaN where the file says nothing.
+    #: (N, 3) standard deviations of east, north and height, in the unit of length; NaN: not in the file.
     sigma: FloatArray
     system: CoordinateSystem
     #: Where they come from, for messages.
@@ -131,7 +131,7 @@ def common_frame(groups: Sequence[Places], wanted: str | None = None) -> tuple[l
         If systems cannot be joined, or longitude and latitude are exchanged.
     """
     told = [group for group in groups if np.isfinite(group.coordinates).any()]
-    if len(told) < len(groups):  # marks of points whose place was not measured say nothing of the frame
+    if len(told) < len(groups):  # marks of points without coordinates do not determine the frame
         found, frame = common_frame(told, wanted)
         return [found.pop(0) if group in told else group.coordinates for group in groups], frame
     for group in groups:
@@ -166,7 +166,7 @@ def described(system: str) -> str:
     Raises
     ------
     InputError
-        If pyproj is there and knows no such system.
+        If pyproj is installed and has no such system.
     """
     code = system.removeprefix("EPSG:")
     if code.isdigit() and (32601 <= int(code) <= 32660 or 32701 <= int(code) <= 32760):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Positions that cameras wrote into their photographs: the GPS part of EXIF, of JPEG and TIFF files.
 
-Only the first bytes of a file are read, and only the numbers asked for; what is damaged counts as missing.
+Only the first bytes of a file are read, and only the requested tags; damaged ones count as missing.
 
 Reference: CIPA DC-008, *Exchangeable image file format*, sections 4.5 and 4.6.6.
 """

@@ -56,7 +56,7 @@ def read_positions(path: str | os.PathLike[str]) -> Places:
     Raises
     ------
     FileFormatError
-        If the file is damaged, or its columns cannot be told.
+        If the file is damaged, or its columns cannot be identified.
     """
     place = existing(path)
     with reading(place, _KIND):

@@ -44,7 +44,7 @@ class DistancesFile:
     #: (N,) names of what each is between.
     first: tuple[str, ...]
     second: tuple[str, ...]
-    #: (N,) distance and its standard deviation, NaN where the file says nothing.
+    #: (N,) distance and its standard deviation, NaN: not in the file.
     distance: FloatArray
     sigma: FloatArray
     #: Where they come from, for messages.
@@ -55,11 +55,11 @@ class DistancesFile:
 class PlanesFile:
     """Known planes as a file holds them."""
 
-    #: (N,) names of what is on each.
+    #: (N,) names of the objects on each.
     names: tuple[str, ...]
     #: (N, 4) unit normals and offsets.
     hesse: FloatArray
-    #: (N,) standard deviations, NaN where the file says nothing.
+    #: (N,) standard deviations, NaN: not in the file.
     sigma: FloatArray
     source: str
 
@@ -72,9 +72,9 @@ class DirectionsFile:
     names: tuple[str, ...]
     #: (N, 3) unit vectors: of photographs in the camera, of landmarks in the world.
     vectors: FloatArray
-    #: (N, 3) what photographs see there, a unit vector of the world; down where the file says nothing.
+    #: (N, 3) the same direction as a unit vector of the world; down by default.
     in_world: FloatArray
-    #: (N,) standard deviations, degrees, NaN where the file says nothing.
+    #: (N,) standard deviations, degrees, NaN: not in the file.
     sigma_deg: FloatArray
     source: str
 
@@ -112,7 +112,7 @@ def read_distances(path: str | os.PathLike[str]) -> DistancesFile:
 
 
 def read_known_planes(path: str | os.PathLike[str]) -> PlanesFile:
-    """Read what is on known planes; see the module for the layout.
+    """Read objects on known planes; see the module for the layout.
 
     Raises
     ------

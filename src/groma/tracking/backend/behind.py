@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Work that is begun and asked for later: in other threads, or where there are none, when it is asked for.
+"""Deferred work: in other threads, or without them when its result is requested.
 
-What a frame causes in the map goes on behind its answer, and who looks at the map next waits for it.
+Work on the map that a frame causes continues after its pose is returned; the next access to the map waits for it.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from typing import Any
 
 
 class OnDemand:
-    """Stands for a future where there are no threads: the work is done when its result is asked for."""
+    """A future without a thread: the work is done when its result is requested."""
 
     def __init__(self, work: Callable[[], Any]) -> None:
         self.result = work
 
 
 class Behind:
-    """One piece of work at a time, in a thread of its own if wanted."""
+    """Runs one task at a time, optionally in its own thread."""
 
     def __init__(self, threaded: bool) -> None:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="groma-behind") if threaded else None
@@ -30,12 +30,12 @@ class Behind:
         self._begun = OnDemand(work) if self._pool is None else self._pool.submit(work)
 
     def stand_still(self) -> None:
-        """Wait until no thread is at work; what is interrupted here is still there."""
+        """Wait until no thread is at work; after an interrupt the task is still pending."""
         if isinstance(self._begun, Future):
             wait([self._begun])
 
     def result(self) -> Any:
-        """Return what the work gave, or raise what it raised; None if there was none."""
+        """Return the result of the task, or raise its exception; None without a task."""
         self.stand_still()
         begun, self._begun = self._begun, None
         return None if begun is None else begun.result()

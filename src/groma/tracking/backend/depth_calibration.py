@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""By how much the depths of a depth camera are off, estimated from a map, and the map corrected.
+r"""The offset of the inverse depths of a depth camera, estimated from a map, and the map corrected.
 
-A depth camera measures a disparity; where that is off by a constant, so are inverse depths,
+A depth camera measures a disparity; a constant error of it is one of inverse depths,
 
 .. math:: \frac1z = \frac1{\tilde z} + c ,
 
-and depths by a share that grows with the depth. A camera that moves sees the same from far and near, so the map tells
-the offset c: the cost of all measurements, least over poses and landmarks, is a function of c alone. Its slope at the
-least cost is that of the depths by themselves, poses and landmarks held; where the slope vanishes, between two solved
-maps, is c. (A common factor of all depths is that of the whole map, which images do not tell.)
+and an error of depths that grows with the depth. A moving camera sees the same from far and near, so the map determines
+the offset c: the cost of all measurements, minimised over poses and landmarks, is a function of c alone. Its slope at
+the minimum is that of the depths alone, with poses and landmarks held; c is where the slope vanishes, between two
+solved maps. (A common factor of all depths is the scale of the map, which images do not determine.)
 
-Errors of one image go together: its depths, planes and segments come from the same disparities. Images count as samples
-therefore, not depths: the variance is larger than the curvature of the cost says by what the slopes of images show.
-With what is known beforehand (the offset is about as large as the noise of a single depth) this gives the mean of the
-posterior, the offset of least expected squared error; where the map tells little, it is close to zero. One far larger
-than the noise of depths is no offset: something else is wrong, a focal length perhaps, and it is left out.
+Errors within one image are correlated: its depths, planes and segments come from the same disparities. The samples are
+therefore images, not depths, and the variance is inflated by the spread of their slopes. With the prior (the offset is
+about as large as the noise of a single depth) this gives the posterior mean, which is close to zero where the map
+determines the offset poorly. An offset far larger than the noise has another cause, a focal length perhaps, and is not
+applied.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class DepthOffset:
 
 
 def estimate_depth_offset(track_map: TrackMap, camera: TrackCamera, options: TrackOptions) -> DepthOffset | None:
-    """Return by how much the inverse depths of a map are off; None where there are none to tell.
+    """Return the offset of the inverse depths of a map; None without depths.
 
     What is known beforehand is that the common error is no larger than the noise of a single depth.
     """
@@ -74,7 +74,7 @@ def estimate_depth_offset(track_map: TrackMap, camera: TrackCamera, options: Tra
     maps = _Maps(track_map, camera, options)
     settled = maps.solved(0.0, None)
     slope = maps.slopes(0.0, settled).sum()
-    # One step of the size of the prior tells the curvature, and a second one the place where the slope vanishes.
+    # One step of the size of the prior gives the curvature, a second one the zero of the slope.
     first = -math.copysign(prior, slope)
     there = maps.solved(first, settled)
     curvature = (maps.slopes(first, there).sum() - slope) / first

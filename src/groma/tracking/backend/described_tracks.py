@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Tracks of described features through the keyframes of stereo pairs, found without any map.
 
-Points that are followed are looked for where the map expects them. If the map's depths are wrong, because the right
+Tracked points are searched near their predicted place. If the map's depths are wrong, because the right
 camera is turned, those that slide along their epipolar line to where they are expected agree with it. Features that are
-matched by their descriptors know of no map: what they tell of the right camera does not depend on what was assumed.
+matched by their descriptors are independent of the map, and so of the assumed pose of the right camera.
 """
 
 from __future__ import annotations

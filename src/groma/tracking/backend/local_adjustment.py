@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Adjust keyframes and what they see: a window with older keyframes held, or all of them at the end.
 
-A job is prepared from the map, solved without looking at the map (so a thread may do it while tracking goes on), and
+A job is prepared from the map, solved without access to the map (so in a thread, during tracking), and
 applied to the map. Landmarks are eliminated; planes and poses remain in the reduced system.
 """
 
@@ -31,7 +31,7 @@ from groma.tracking.pose.estimate import GATE
 
 #: Keyframes outside the window that are held as its border.
 BORDER = 8
-#: Columns in right images whose noise is taken from themselves, and what it is at least, of what is stated.
+#: Number of columns in right images from which their noise is estimated, and its lower bound, of the stated one.
 MIN_COLUMNS, LEAST_NOISE = 100, 0.05
 
 
@@ -127,7 +127,7 @@ class AdjustmentJob:
     def _forget_columns(self, at: FloatArray) -> None:
         """Forget columns in right images that lie far from the others, as of points that are hidden there.
 
-        Their noise is a fraction of what is stated for points, so it is taken from the columns themselves.
+        Their noise is a fraction of that stated for points, so it is estimated from the columns themselves.
         """
         table = self.point_table
         found = np.flatnonzero(np.isfinite(table.right[:, 0]))
@@ -204,7 +204,7 @@ def job_of(
         for kind in ("points", "lines", "planes")
     }
     in_table = {kind: np.concatenate(rows[kind]) if rows[kind] else np.zeros(0, np.int64) for kind in rows}
-    # Points seen once tell nothing about poses; points that no free keyframe sees neither.
+    # Points seen once, or by no free keyframe, do not constrain poses.
     free = ~held
     often = np.bincount(points.index, minlength=len(track_map.points)) >= min_views
     moving = np.zeros(len(track_map.points), dtype=bool)

@@ -2,7 +2,7 @@
 """Places seen before: keyframes that recognise them by described features, and maps that are moved and joined there.
 
 Each new keyframe is compared with older ones that share nothing with it. Enough features must match, and agree on one
-pose. How well it is known, :mod:`groma.tracking.backend.place_again` says; loops are closed by
+pose. Its uncertainty is estimated by :mod:`groma.tracking.backend.place_again`; loops are closed by
 :mod:`groma.tracking.backend.metric_loops` and :mod:`groma.tracking.backend.scaled_loops`.
 """
 
@@ -34,7 +34,7 @@ class LoopSearch:
     gates: TrackingGates
 
     def run(self) -> list[tuple[Keyframe, IntArray, IntArray]]:
-        """Return the candidates whose descriptions match best, with the rows of the pairs; looks at no map."""
+        """Return the candidates whose descriptions match best, with the rows of the pairs; no access to the map."""
         features, gates, max_bits = self.newest.features, self.gates.loops, self.gates.features.max_bits
         strongest = np.argsort(-features.response, kind="stable")[: gates.voters]
         voters = replace(features, pixel=features.pixel[strongest], descriptor=features.descriptor[strongest])
@@ -128,7 +128,7 @@ def known_loops(track_map: TrackMap, living: list[Keyframe]) -> tuple[IntArray, 
 
 
 def move(track_map: TrackMap, living: list[Keyframe], similarities: FloatArray) -> None:
-    """Move keyframes, and what they first saw, to where similarities (n, 8), cam_from_world, say.
+    """Move keyframes, and the landmarks that they first saw, to similarities (n, 8), cam_from_world.
 
     Their scales go into the lengths: what a keyframe saw grows by the inverse of its scale.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What goes on behind the frames: keyframes, adjustment of windows, and loops, partly in threads of their own."""
+"""Work between frames: keyframes, adjustment of windows, and loops, partly in other threads."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from groma.tracking.stopwatch import Stopwatch
 
 @dataclass
 class Present:
-    """Where the camera is: the last tracked frame, its pose, and what is followed from it."""
+    """The last tracked frame: its pose and tracked features."""
 
     data: FrameFeatures | None = None
     pose: FloatArray = field(default_factory=se3.identity)
@@ -60,7 +60,7 @@ class _Chosen:
 
     def is_ready(self, now: float, delay: int, seconds: float) -> bool:
         """Whether frames have passed in which its features were found: so many, and so many seconds by the camera's
-        clock. No other clock is looked at, so that runs repeat exactly.
+        clock. No other clock is used, so that runs are reproducible.
         """
         self.age += 1
         return self.age >= delay and now - self.data.frame.timestamp >= seconds
@@ -88,7 +88,7 @@ class Mapper:
         #: How maps join older ones, by the number of the newer.
         self.joints: dict[int, Joint] = {}
         self.camera, self.options = camera, options
-        #: The right camera of stereo pairs, and the number of keyframes that tell next how it is turned.
+        #: The right camera of stereo pairs, and the number of keyframes at which its rotation is estimated next.
         self.right = RightCamera(camera, options.gates.rectification, options.gates.features, right_turn)
         self._next_look = options.gates.rectification.min_keyframes
         #: What the first keyframes were made with, and whether the track may still start over.
@@ -129,7 +129,7 @@ class Mapper:
         }
 
     def begin_anew(self, present: Present) -> None:
-        """Leave the present map, and begin another."""
+        """Leave the current map and start another."""
         self.leave(present)
         if self.maps[-1].keyframes:
             self.maps.append(TrackMap())

@@ -36,7 +36,7 @@ from groma.tracking.result import map_to_scene
 
 @dataclass(frozen=True, eq=False)
 class KnownMap:
-    """A map, and how well it knows its points."""
+    """A map with the uncertainty of its points."""
 
     track_map: TrackMap
     camera: TrackCamera
@@ -165,7 +165,7 @@ def _refined(
 def join_place(track_map: TrackMap, place: PlaceAgain, options: TrackOptions) -> None:
     """Let the newest keyframe see the points that a place had before, and make one of lines that it has twice.
 
-    Points at matched features stay apart: features match to a pixel or two, which followed points know far better.
+    Points at matched features stay apart: features match to a pixel or two, tracked points far better.
     """
     newest = place.newest
     join_lines(track_map, place.lines)
@@ -192,7 +192,7 @@ def _described(keyframe: Keyframe, rows: IntArray, options: TrackOptions) -> Poi
 
 
 def _around(track_map: TrackMap, keyframe: Keyframe, newest: Keyframe, gates: TrackingGates) -> list[Keyframe]:
-    """Return a keyframe and those that see most of what it sees, of the same time."""
+    """Return a keyframe and those of the same period that share most landmarks with it."""
     others = [
         one
         for one in track_map.living()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Planes of the map's own points and lines after an adjustment with them: which hold, and what is said of it."""
+"""Planes of the map's own points and lines after an adjustment with them: which hold, and the message."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class PlaneOutcome:
 
     @property
     def sentence(self) -> str:
-        """What is said of it."""
+        """The message."""
         among = f"{counted(self.searched[0], 'points')} and {counted(self.searched[1], 'lines')} of the map"
         if not self.found:
             return f"No planes: none stands out from the {among}."

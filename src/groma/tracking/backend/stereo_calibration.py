@@ -52,7 +52,7 @@ YAW = 4
 def estimate_turn(
     track_map: TrackMap, camera: TrackCamera, turn: RightTurn, options: TrackOptions
 ) -> tuple[RightTurn, AdjustmentJob | None]:
-    """Return how the right camera is turned, and the adjustment of the map that told it, if one did.
+    """Return the rotation of the right camera, and the adjustment of the map that estimated it, if any.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def estimate_turn(
     turn
         By which the right images of the map were turned back.
     options
-        Their gates say what is known beforehand, and how much an estimate needs.
+        Their gates hold the prior and the data that an estimate needs.
     """
     gates = options.gates.rectification
     known = RightTurn.unknown(gates).joined(*_rows_of(track_map, camera, turn, gates))
@@ -77,7 +77,7 @@ def estimate_turn(
 
 
 def tells_yaw(camera: TrackCamera, turn: RightTurn, gates: RectificationGates) -> bool:
-    """Whether yaw is known so well that a track need not begin anew for what is left."""
+    """Whether yaw is known so well that the track need not restart for the remaining error."""
     return bool(camera.fx**2 * turn.covariance[1, 1] < gates.start_over**2)
 
 
@@ -104,7 +104,7 @@ def _by_columns(
         covariances = Covariances(job.solved)
     except ProblemError:
         return known, None
-    # What columns tell on their own of yaw counts for less where their errors are alike.
+    # The information of columns about yaw is reduced where their errors are correlated.
     before, after = known.covariance[1, 1], covariances.of(RIGHT_CAMERAS, 0)[0, YAW, YAW]
     information = 1.0 / after - 1.0 / before
     if not information > 0.0:
@@ -125,7 +125,7 @@ def _step(keyframes: list[Keyframe]) -> float:
 def _rows_of(
     track_map: TrackMap, camera: TrackCamera, turn: RightTurn, gates: RectificationGates
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the angles that the rows of all pairs of a map tell, and their information."""
+    """Return the angles estimated from the rows of all pairs of a map, and their information."""
     tables = [keyframe.measured.points for keyframe in track_map.living()]
     left = np.concatenate([table.pixel for table in tables])
     right = np.concatenate([table.right for table in tables])
@@ -165,7 +165,7 @@ def correct_map(
     options: TrackOptions,
     job: AdjustmentJob | None,
 ) -> None:
-    """Correct all that right images told a map when they were turned back by other angles.
+    """Correct the measurements of right images, which were rectified with other angles.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ def correct_map(
     old, new
         The angles, and those that are known better.
     job
-        The adjustment of :func:`estimate_turn`, if that is the map that told the angles: its poses and points.
+        The adjustment of :func:`estimate_turn`, if it was of this map: its poses and points.
     """
     change = _Change(camera, old.angles, new.angles)
     _correct_points(track_map, change, job)

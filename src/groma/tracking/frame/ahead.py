@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The frame after the present one, where it is known: what is found in it meanwhile, by other threads."""
+"""Features of the next frame, if known, computed in other threads."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ PINHOLE = "PINHOLE"
 
 @loop
 def _clip_segments(ends_in_cam, K, size, limits, ends, seen):
-    """Write segments (L, 2, 3) in pixels, cut to what is in front of ``near`` and inside a border; which are seen."""
+    """Write segments (L, 2, 3) in pixels, clipped beyond ``near`` and within a border; flag visible ones."""
     near, border = limits
     P, start, way = np.empty((2, 3)), np.empty(2), np.empty(2)
     for i in range(ends_in_cam.shape[0]):
@@ -132,7 +132,7 @@ class TrackCamera:
             )
 
     def project_segments(self, ends_in_cam: FloatArray, border: float = 0.0) -> tuple[FloatArray, BoolArray]:
-        """Project segments (L, 2, 3) and clip them to what is in front of the camera and in the image.
+        """Project segments (L, 2, 3) and clip them to the part in front of the camera and in the image.
 
         Returns (L, 4) pixels, and which of them are seen at all.
         """

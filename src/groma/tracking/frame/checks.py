@@ -15,7 +15,7 @@ from groma.tracking.gates import DEFAULT, CheckGates
 
 
 class FrameChecks:
-    """Checks frames one by one, and keeps what is worth saying at the end."""
+    """Checks frames one by one, and collects the warnings."""
 
     def __init__(self, camera: TrackCamera, gates: CheckGates = DEFAULT.checks) -> None:
         self._camera, self._gates = camera, gates

@@ -193,7 +193,7 @@ def turn_between(
     before, now
         From :func:`small_image`.
     starts
-        Rotations to begin from, beside the shift that correlation finds.
+        Initial rotations, besides the shift found by correlation.
     gates
         Numbers of the alignment.
     """
@@ -230,7 +230,7 @@ def _align(
 ) -> tuple[FloatArray, float]:
     """Gauss-Newton on the rotation; return the best one with the correlation of the images where they overlap.
 
-    One step tells how well they agree at the start.
+    One step gives their initial agreement.
     """
     best = np.array(start, dtype=np.float64)
     limits = float(gates.outlier), float(gates.min_overlap), float(gates.converged)

@@ -13,7 +13,7 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import FloatArray, IntArray
 
-#: Height of the bands that features are sorted into, pixels (cost: features that are looked at).
+#: Height of the bands into which features are sorted, pixels (cost: number of comparisons).
 BAND = 16.0
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -34,7 +34,7 @@ def _best_near(expected, first, pixel, second, order, begin, band, radius, max_b
 
     The rows of ``pixel`` and ``second`` are sorted into bands of the image, each in order of u; band k begins at
     ``begin[k]``. ``order`` has their numbers, which ``partner`` is about; of rows that are as good the least counts.
-    ``partner``, ``bits`` and ``distance`` are of first and second, one after the other.
+    ``partner``, ``bits`` and ``distance`` hold first, then second.
     """
     count, words, bands = expected.shape[0], first.shape[1], begin.shape[0] - 1
     for i in range(count):
@@ -129,7 +129,7 @@ def pair_anywhere(first: np.ndarray, second: np.ndarray, max_bits: int) -> tuple
 class PlacedFeatures:
     """Described features of an image, sorted by their places: in bands, and from left to right in each."""
 
-    #: (m, 2) pixels, (m, 4) words of descriptors, (m,) their numbers, (bands + 1,) where each band begins.
+    #: (m, 2) pixels, (m, 4) words of descriptors, (m,) their numbers, (bands + 1,) starts of the bands.
     pixel: FloatArray
     words: np.ndarray
     number: IntArray

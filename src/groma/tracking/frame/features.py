@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What is found in one frame: described features, segments with depth, planes; computed when first asked for."""
+"""The features of one frame: described points, segments with depth, planes; computed on first access."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _Found = TypeVar("_Found")
 
 
 class _FoundOnce(Generic[_Found]):
-    """A property that is worked out by whichever thread asks first, while others that ask wait for it."""
+    """A cached property, computed by the first thread that reads it while others wait."""
 
     def __init__(self, find: Callable[[Any], _Found]) -> None:
         self._find, self._name, self.__doc__ = find, find.__name__, find.__doc__
@@ -58,7 +58,7 @@ class _FoundOnce(Generic[_Found]):
     def __get__(self, instance: FrameFeatures | None, owner: type) -> _FoundOnce[_Found] | _Found:
         if instance is None:
             return self
-        found = vars(instance)  # what is found lies there under the same name, and is taken from there afterwards
+        found = vars(instance)  # the value is stored there under the same name
         with instance.lock_of(self._name):
             if self._name not in found:
                 found[self._name] = self._find(instance)
@@ -163,7 +163,7 @@ class FrameFeatures:
             self.prepare(searching)
 
     def wait(self) -> None:
-        """Wait for what :meth:`prepare` began; what nobody has begun yet is found when it is asked for."""
+        """Wait for the computations that :meth:`prepare` started; others follow on access."""
         for future in self._work:
             if not future.cancel():
                 future.result()
@@ -176,7 +176,7 @@ class FrameFeatures:
 
     @_FoundOnce
     def small(self) -> SmallImage:
-        """A small image, which tells how the camera turned."""
+        """A small image for coarse rotations."""
         return small_image(self.gray, self.options.gates.turns)
 
     @_FoundOnce
@@ -246,7 +246,7 @@ class FrameFeatures:
     def right_pixels(self, pixels: FloatArray, expected: FloatArray | None = None) -> FloatArray:
         """Pixels (N, 2) in the right image; NaN where not found or without one.
 
-        With ``expected`` (N,) columns only the points that have one are looked for.
+        With ``expected`` (N,) columns only points that have one are searched.
         """
         if self.right is None:
             return np.full((len(pixels), 2), np.nan)

@@ -30,8 +30,8 @@ class PointMeasurements(Rows):
     #: (N,) depth and its standard deviation, scene units; NaN where unknown.
     depth: FloatArray = column()
     depth_sigma: FloatArray = column()
-    #: (N, 2) pixel in the right image of a pair, turned back as it was known then; NaN where unknown. Its row tells
-    #: nothing but how the right camera is turned.
+    #: (N, 2) pixel in the right image of a pair, rectified by the estimate of that time; NaN where unknown. Its row
+    #: depends on the rotation of the right camera only.
     right: FloatArray = column(2)
 
 

@@ -44,7 +44,7 @@ class FramePlanes:
 
     @cached_property
     def place_rows(self) -> tuple[IntArray, IntArray]:
-        """Rows of the places, plane by plane, and (K + 1,) where those of each begin."""
+        """Rows of the places, plane by plane, and their bounds (K + 1,)."""
         rows = np.argsort(self.place_plane, kind="stable")
         return rows, np.searchsorted(self.place_plane[rows], np.arange(len(self) + 1))
 

@@ -44,7 +44,7 @@ class RightTurn:
 
     @classmethod
     def unknown(cls, gates: RectificationGates = DEFAULT.rectification) -> RightTurn:
-        """Return what is known of any rectified pair."""
+        """Return the prior of a rectified pair."""
         return cls(np.zeros(3), np.eye(3) * np.radians(gates.sigma_deg) ** 2)
 
     def joined(self, other: FloatArray, information: FloatArray) -> RightTurn:
@@ -54,11 +54,11 @@ class RightTurn:
         return RightTurn(covariance @ (own @ self.angles + information @ other), covariance)
 
     def is_as_sure_as(self, other: RightTurn, gates: RectificationGates = DEFAULT.rectification) -> bool:
-        """Whether the angle that is hardest to tell, yaw, is known as well as in an earlier estimate."""
+        """Whether yaw, the least determined angle, is known as well as in an earlier estimate."""
         return bool(self.covariance[1, 1] <= gates.as_sure * other.covariance[1, 1])
 
     def confirming(self, assumed: RightTurn) -> RightTurn:
-        """Return the estimate with what followed points cannot tell: in part they agree with what was assumed.
+        """Return the estimate with the uncertainty that tracked points leave: in part they follow the assumed rotation.
 
         Up to half of an error stayed where it was measured; then as much is left as was found.
         """
@@ -92,7 +92,7 @@ class RightCamera:
         self._looks = gates.looks if turn is None else 0
 
     def rows_aligned(self, left: GrayImage, right: GrayImage) -> GrayImage:
-        """Return a right image with the rows of the left one; the first pairs tell pitch and roll.
+        """Return a right image with the rows of the left one; pitch and roll are estimated from the first pairs.
 
         Raises
         ------

@@ -48,7 +48,7 @@ def match_right(
 ) -> FloatArray:
     """Pixels (N, 2) of points of the left image in the rectified right one; NaN where not found.
 
-    ``expected`` (N,) are columns known beforehand; where they are NaN, the disparities ``coarse`` tell where to look.
+    ``expected`` (N,) are predicted columns; where they are NaN, the search starts at the disparities ``coarse``.
     The right image may be one that is not rectified: ``into_image`` moves rectified pixels there, and
     ``out_of_image`` back. Nothing is resampled, which would shift columns by hundredths of a pixel.
     """
@@ -60,7 +60,7 @@ def match_right(
     if coarse is not None and unknown.any():
         height, width = left.shape
         around = _places_around(gates.around)
-        # Beside a corner often one side alone is told apart: the nearest of the surroundings then.
+        # Beside a corner often only one side has a disparity: take the nearest one.
         row = np.clip(pixels[unknown, 1].astype(np.int64) + around[:, :1], 0, height - 1)
         column = np.clip(pixels[unknown, 0].astype(np.int64) + around[:, 1:], 0, width - 1)
         near = coarse[row, column]
@@ -80,6 +80,6 @@ def match_right(
 
 
 def _places_around(reach: int) -> IntArray:
-    """Offsets (25, 2) in pixels at which a disparity is looked for beside a pixel that has none, nearest first."""
+    """Offsets (25, 2) in pixels at which a disparity is searched near a pixel without one, nearest first."""
     steps = (-reach, -(reach // 2), 0, reach // 2, reach)
     return np.array(sorted(((v, u) for v in steps for u in steps), key=lambda at: at[0] ** 2 + at[1] ** 2))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Numbers of the map: keyframes, points, lines and planes, and what goes."""
+"""Gates of the map: keyframes, points, lines and planes, and culling."""
 
 from __future__ import annotations
 

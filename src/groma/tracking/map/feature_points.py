@@ -20,7 +20,7 @@ from groma.tracking.options import TrackOptions
 
 
 def match_features(first: Features, second: Features, max_bits: int) -> tuple[IntArray, IntArray]:
-    """Pair features whose descriptors are nearest and differ in at most so many bits; return the rows of both."""
+    """Match features by nearest descriptors within a number of bits; return the rows of both."""
     return pair_anywhere(first.descriptor, second.descriptor, max_bits)
 
 

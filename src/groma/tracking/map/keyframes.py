@@ -59,7 +59,7 @@ def wants_keyframe(
 
 
 def keyframe_nearby(track_map: TrackMap, pose: FloatArray, options: TrackOptions) -> Keyframe | None:
-    """Return the living keyframe that looks most like a pose, if one is near enough to stand for it."""
+    """Return the active keyframe with the most similar pose, if it is near enough."""
     living = [keyframe for keyframe in track_map.living() if keyframe.gray is not None]
     poses = np.array([keyframe.pose for keyframe in living])
     motion = se3.log(se3.compose(np.tile(pose, (len(living), 1)), se3.inverse(poses)))
@@ -80,7 +80,7 @@ def add_keyframe(
     followed: Followed,
     options: TrackOptions,
 ) -> Followed:
-    """Make a keyframe of a frame whose pose is known; return what is followed from now on."""
+    """Make a keyframe of a frame with a pose; return the features tracked from now on."""
     index = len(track_map.keyframes)
     tracks, features = _add_points(track_map, camera, data, pose, followed.points, index, options)
     segments, lines = followed.lines, LineMeasurements.empty()
@@ -195,7 +195,7 @@ def _place_pending(track_map: TrackMap, camera: TrackCamera, data: FrameFeatures
 
 
 def _poses_of(track_map: TrackMap, keyframes: IntArray) -> FloatArray:
-    """Poses (n, 7) of keyframes, each looked up once."""
+    """Poses (n, 7) of keyframes."""
     unique, which = np.unique(keyframes, return_inverse=True)
     return np.array([track_map.pose_of(int(k)) for k in unique])[which]
 
@@ -306,7 +306,7 @@ def _ray_planes(camera: TrackCamera, poses: FloatArray, ends: FloatArray) -> tup
 
 
 def _extend_lines(track_map: TrackMap, camera: TrackCamera, pose, index, ends, max_extension: float) -> None:
-    """Lengthen lines to what is seen of them now."""
+    """Extend lines to their observed segments."""
     lines = track_map.lines
     alive = np.flatnonzero(lines.alive[index])
     rows = index[alive]

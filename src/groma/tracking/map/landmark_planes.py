@@ -99,7 +99,7 @@ def _chosen(scene: Scene, gates: LandmarkPlaneGates) -> list[_Claim]:
         if left.support < gates.min_own * claim.support or kept.support < gates.min_support:
             continue
         chosen.append(kept)
-        # Nothing else lies in its layer: relief so near to a plane cannot be told from it.
+        # Nothing else lies in its layer: relief so near cannot be distinguished from the plane.
         normal, offset = claim.hesse[:3], claim.hesse[3]
         free_point &= np.abs(scene.points.xyz @ normal + offset) > claim.band
         free_line &= (np.abs(scene.lines.segments @ normal + offset) > claim.band).any(axis=1)

@@ -53,7 +53,7 @@ class _Growing:
         return rows
 
     def copy(self) -> Self:
-        """Return a table of its own with the same rows."""
+        """Return an independent copy."""
         out = type(self)()
         out.count, out._arrays = self.count, {name: array.copy() for name, array in self._arrays.items()}
         out._show_rows()

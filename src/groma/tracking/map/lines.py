@@ -3,7 +3,7 @@
 
 Between keyframes a line is *followed*: points along its last segment are carried by coarse dense flow and vote for
 where it went, and the edge is then measured in the image (:mod:`groma.features.edge_fit`). At keyframes segments are
-*detected* and assigned to lines by where the map says they are: near, parallel, the dark side on the same hand,
+*detected* and assigned to lines by their predicted images: near, parallel, the dark side on the same hand,
 overlapping, and best for both. A depth measured along the segment must agree too.
 """
 

@@ -26,7 +26,7 @@ def _is_near(samples, places, step, reach):
 
 @loop
 def _refuse_apart(samples, alive, places, rows, begin, limits, score):
-    """Make scores infinite where no place of a plane (``rows`` from its ``begin``) is near a sample of the other."""
+    """Set scores to infinity where no place of a plane (``rows`` from its ``begin``) is near a sample of the other."""
     compared, reach = limits
     for i in range(score.shape[0]):
         for j in range(score.shape[1]):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Points followed from frame to frame, held to the patches of the last keyframe, and found again where the map says."""
+"""Points tracked from frame to frame, aligned with the patches of the last keyframe, and found by projection."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def find_again(
     points = track_map.points
     wanted = points.alive.copy()
     wanted[tracks.index] = False
-    # Only what recent and overlapping keyframes saw; the rest of a large map is not looked at in every frame.
+    # Only landmarks of recent and overlapping keyframes; the rest of a large map is not searched in every frame.
     rows = np.flatnonzero(wanted)
     if not len(rows):
         return PointTracks.empty()

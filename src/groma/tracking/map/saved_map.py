@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The map of an earlier track, to be tracked in: its scene, and the frames of its keyframes, become a map again.
 
-The scene says where keyframes and landmarks are and what was measured in which image; depths, described features and
+The scene holds keyframes, landmarks and observations; depths, described features and
 edges are found again in the frames, as they were then. A keyframe has no time stamp: that of a frame to come may be the
 same.
 """

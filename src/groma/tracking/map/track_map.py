@@ -22,7 +22,7 @@ def in_unit(motion: FloatArray, unit: float) -> FloatArray:
 
 @dataclass(eq=False)
 class Keyframe:
-    """A frame that stays: its image for patches, what it measures, and its described features."""
+    """A frame that is kept: its image for patches, its measurements, and its described features."""
 
     index: int
     timestamp: float
@@ -36,7 +36,7 @@ class Keyframe:
     depth_grid: FloatArray
     #: Median depth of its points, scene units.
     depth: float = 1.0
-    #: False once it was found to repeat what others see; its pose is then told by another's.
+    #: False once it is redundant; its pose is then relative to another keyframe.
     alive: bool = True
     parent: int = -1
     from_parent: FloatArray | None = None
@@ -54,7 +54,7 @@ class Keyframe:
 
 @dataclass
 class TrackMap:
-    """Everything a track knows about the world. It changes while the track goes on."""
+    """The map of a track. It is mutable."""
 
     points: PointTable = field(default_factory=PointTable)
     lines: LineTable = field(default_factory=LineTable)
@@ -118,7 +118,7 @@ class TrackMap:
         )[0]
 
     def unit_of(self, index: int) -> float:
-        """Unit of a keyframe, also of one that was dropped: that of the keyframe which tells its pose."""
+        """Unit of a keyframe; of a dropped one, that of the keyframe to which its pose refers."""
         keyframe = self.keyframes[index]
         return keyframe.unit if keyframe.from_parent is None else self.unit_of(keyframe.parent)
 

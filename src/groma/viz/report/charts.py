@@ -20,12 +20,12 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 58, 12, 10, 40
 
 
 def svg(label: str, body: list[str], height: int = HEIGHT) -> str:
-    """Return a drawing; ``label`` says what it is to those who cannot see it."""
+    """Return a drawing; ``label`` describes it for screen readers."""
     return f'<svg viewBox="0 0 {WIDTH} {height}" role="img" aria-label="{html.escape(label)}">{"".join(body)}</svg>'
 
 
 def text(x: float, y: float, words: str, anchor: str = "middle") -> str:
-    """Return words at a place."""
+    """Return a text at a place."""
     return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{html.escape(words)}</text>'
 
 
@@ -84,7 +84,7 @@ def _shares(values: FloatArray, edges: FloatArray) -> FloatArray:
 
 
 def entry(step: Any) -> Mapping[str, Any]:
-    """Return a step of a history as a mapping, whether it is one or an object."""
+    """Return a step of a history, a mapping or an object, as a mapping."""
     return step if isinstance(step, Mapping) else vars(step)
 
 
@@ -97,7 +97,7 @@ def convergence(history: Sequence[Any], stages: Sequence[Mapping[str, Any]] = ()
         Mappings or objects with ``iteration``, ``cost``, ``accepted`` and perhaps ``stage``; costs of different
         stages belong to different losses and are not joined.
     stages : sequence of mappings, optional
-        ``loss``, ``initial_cost`` and ``first_step`` of each stage: where its curve begins, and its name.
+        ``loss``, ``initial_cost`` and ``first_step`` of each stage.
     """
     rows = [entry(row) for row in history]
     rows += [

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Covariances of landmarks and camera centres, for what is measured on the page (``groma adjust --covariance``)."""
+"""Covariances of landmarks and camera centres, for measurements on the page (``groma adjust --covariance``)."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from groma.scene import Scene
 
 
 class Uncertainty(Protocol):
-    """What the page reads of the uncertainty of a scene, such as :func:`groma.uncertainty` returns it."""
+    """Interface to the uncertainty of a scene (:func:`groma.uncertainty`)."""
 
     @property
     def gauge(self) -> str:
-        """What they refer to."""
+        """Gauge of the covariances."""
 
     @property
     def points(self) -> FloatArray:
@@ -45,7 +45,7 @@ class Uncertainty(Protocol):
 class LandmarkCovariances:
     """Covariances in the order of a scene; NaN where they are not known."""
 
-    #: What they refer to: ``inner`` or ``held``.
+    #: Gauge: ``inner`` or ``held``.
     gauge: str
     #: (P, 3, 3) of points, (L, 6, 6) of Plücker coordinates (m, d), (K, 4, 4) of planes (n, w), (N, 3, 3) of centres.
     points: FloatArray
@@ -68,7 +68,7 @@ class LandmarkCovariances:
 
 
 def covariances_of(scene: Scene, found: Uncertainty) -> LandmarkCovariances:
-    """Return the covariances of a scene, from what :func:`groma.uncertainty` found for it."""
+    """Return the covariances of a scene from the result of :func:`groma.uncertainty`."""
     return LandmarkCovariances(
         found.gauge, found.points, found.lines, found.planes, _of_images(scene, found.centers, scene.images.frame_idx)
     )
@@ -120,7 +120,7 @@ def read_covariances(path: str | os.PathLike[str], scene: Scene) -> LandmarkCova
 
 
 def _matched(covariances: FloatArray, ids: IntArray, wanted: IntArray) -> FloatArray:
-    """Return the covariances of wanted identifiers; NaN for those that the file does not name."""
+    """Return the covariances of the given identifiers; NaN for those not in the file."""
     if len(ids) != len(covariances):
         raise FileFormatError(f"Expected as many identifiers as covariances; got {len(ids)} and {len(covariances)}.")
     found = np.full((len(wanted), *covariances.shape[1:]), np.nan)
@@ -134,7 +134,7 @@ def _matched(covariances: FloatArray, ids: IntArray, wanted: IntArray) -> FloatA
 
 
 def _of_images(scene: Scene, centers: FloatArray, frames: IntArray) -> FloatArray:
-    """Return the covariances of camera centres; those of sensors beside the reference of a rig are not known."""
+    """Return the covariances of camera centres; NaN for rigs, whose covariances are those of the rig frames."""
     found = np.full((scene.num_images, 3, 3), np.nan)
     known = (frames >= 0) & (frames < len(centers))
     if scene.has_trivial_rigs:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What the 3D view of the page draws and says, as text: arrays less a common offset, and where to start."""
+"""Data of the 3D view of the page, as text: arrays less a common offset, and the initial viewpoint."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from groma.viz.statistics import LineStatistics, images_of, line_statistics
 def scene_data(
     scenes: Sequence[Scene], states: Sequence[Drawable], kept: Kept, covariances: LandmarkCovariances | None = None
 ) -> dict[str, Any]:
-    """Return the states of a scene for the 3D view, the last one being the one that counts."""
+    """Return the states of a scene for the 3D view; the last one is the current one."""
     scene, after = scenes[-1], states[-1]
     offset = _middle(after)
     meeting = kept.meeting(scene)
@@ -108,7 +108,7 @@ def _planes(scene: Scene, after: Drawable) -> dict[str, Any]:
 
 
 def _cameras(scene: Scene) -> dict[str, Any]:
-    """Return the names of all images, and what opens of each: half the width and half the height at distance one."""
+    """Return the names and aspect ratios of all images."""
     camera = scene.images.camera_idx
     width, height = (np.asarray(side, float)[camera] for side in (scene.cameras.width, scene.cameras.height))
     aspect = np.divide(width, height, out=np.full(len(camera), 4.0 / 3.0), where=height > 0)
@@ -116,7 +116,7 @@ def _cameras(scene: Scene) -> dict[str, Any]:
 
 
 def _relations(scene: Scene, kept: Kept) -> dict[str, str]:
-    """Return pairs of things that belong together, as places among what is kept."""
+    """Return relations as pairs of indices into the kept landmarks."""
     point, line = places_of(kept.points, scene.num_points), places_of(kept.lines, scene.num_lines)
     plane = np.arange(scene.num_planes)
     ends = {
@@ -133,7 +133,7 @@ def _relations(scene: Scene, kept: Kept) -> dict[str, str]:
 
 
 def _covariances(found: LandmarkCovariances, kept: Kept, offset: FloatArray) -> dict[str, Any]:
-    """Return upper triangles of covariances, of coordinates less the offset."""
+    """Return upper triangles of the covariances of coordinates less the offset."""
     local = found.moved(offset)
     return {
         "gauge": found.gauge,
@@ -145,7 +145,7 @@ def _covariances(found: LandmarkCovariances, kept: Kept, offset: FloatArray) -> 
 
 
 def _triangles(matrices: FloatArray) -> str:
-    """Return the upper triangles of symmetric matrices; rows of -1 for those that are not known."""
+    """Return the upper triangles of symmetric matrices; rows of -1 for unknown ones."""
     size = matrices.shape[-1]
     rows = matrices[:, *np.triu_indices(size)]
     return pack(np.where(np.isfinite(rows).all(axis=1, keepdims=True), rows, -1.0))
@@ -155,13 +155,13 @@ def _triangles(matrices: FloatArray) -> str:
 
 
 def _top(errors: FloatArray) -> float:
-    """Return the error that gets the last colour: what 95 of 100 stay below."""
+    """Return the error at the end of the colour ramp: the 95th percentile."""
     known = errors[np.isfinite(errors) & (errors > 0)]
     return float(np.percentile(known, 95)) if len(known) else 1.0
 
 
 def _patches_of(scene: Scene, after: Drawable) -> list[FloatArray]:
-    """Return the pieces of planes of the last state, on the planes of this one."""
+    """Return the patches of the last state, projected onto the planes of this one."""
     return [
         patch - (patch @ plane[:3] + plane[3])[:, None] * plane[:3]
         for patch, plane in zip(after.patches, scene.planes.hesse, strict=True)

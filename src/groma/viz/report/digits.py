@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How many digits a number shows in charts, tables and tiles, and where the ticks of an axis lie."""
+"""Formatting of numbers in charts, tables and tiles, and ticks of axes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 
 def fixed(value: float) -> str:
-    """Return three decimals where they say something, else three digits."""
+    """Return three decimals for magnitudes from 0.01 to 10,000, else three digits."""
     return f"{value:.3f}" if 0.01 <= abs(value) < 1e4 else f"{value:.3g}"
 
 
@@ -56,7 +56,7 @@ def tick_of_step(value: float, step: float) -> str:
 
 
 def round_step(extent: float, most: int) -> float:
-    """Return 1, 2 or 5 times a power of ten: the smallest that divides an extent into at most so many parts."""
+    """Return the smallest of 1, 2 or 5 times a power of ten that divides an extent into at most ``most`` parts."""
     power = 10.0 ** math.floor(math.log10(extent / most))
     return next(factor * power for factor in (1.0, 2.0, 5.0, 10.0) if extent / (factor * power) <= most)
 

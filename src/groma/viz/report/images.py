@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What the page shows in the photographs: residuals of points, measured segments, images of the 3D segments."""
+"""Overlays of the photographs: residuals of points, measured segments, images of 3D segments."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from groma.viz.pictures import ImageFiles, image_file, jpeg_address, read_pictur
 from groma.viz.report.kept import Kept, places_of
 from groma.viz.report.overlays import projected_places
 
-#: Photographs in the page, the longer side of each, pixels, and what all of them may weigh, characters.
+#: Maximum number of photographs, their longer side in pixels, and their total size in characters.
 MAX_PHOTOS = 60
 PHOTO_SIZE = 1100
 PHOTO_BUDGET = 9_000_000
 #: Places along the image of a segment that lens distortion bends.
 _SAMPLES = 6
-#: Gives data addresses of photographs, in the order of the images that observe something.
+#: Returns data URLs of photographs, in the order of the images with observations.
 Photographs = Callable[[], list[str]]
 
 
 def page_photographs(scene: Scene, images: ImageFiles | None) -> Photographs:
-    """Begin to read the photographs of a page, smaller the more there are; empty where there is none.
+    """Start to read the photographs of a page, at a size that depends on their number; empty where there is none.
 
-    They depend on which images observe something alone: a page that is written later need not wait for them.
+    They depend only on which images have observations, so they can be read before the page is written.
     """
     return _photographs([scene.images.names[image] for image in _used(scene)], images)
 
@@ -56,19 +56,19 @@ def _photograph(file: Path, budget: int) -> str:
 
 
 def _used(scene: Scene) -> IntArray:
-    """Return the images that observe something, in the order of their names: a model may have any."""
+    """Return the images with observations, sorted by name."""
     seen = scene.point_observations.image_idx, scene.line_observations.image_idx
     used = np.flatnonzero(sum(np.bincount(one, minlength=scene.num_images) for one in seen))
     return np.array(sorted(used.tolist(), key=lambda image: natural_key(scene.images.names[image])), np.int64)
 
 
 def image_data(scene: Scene, kept: Kept, states: Sequence[Drawable], photographs: Photographs) -> dict[str, Any]:
-    """Return, for the page, an entry per image that observes something, and the rows that the entries point to.
+    """Return an entry per image with observations, and the rows that the entries refer to.
 
-    ``first`` is the entry to begin with. ``rows`` are points: measured place, then the residual in each state.
-    ``segments`` are 2D segments: measured ends, then the ways from them to the image of their line in each state;
-    ``row_points`` and ``segment_lines`` say whose they are, as places among what is kept; ``projected`` are the images
-    of the 3D segments in the last state, ``samples`` places each, zero where there is none.
+    ``first`` is the initial entry. ``rows`` are points: measured place, then the residual in each state.
+    ``segments`` are 2D segments: measured ends, then the vectors from them to the image of their line in each state;
+    ``row_points`` and ``segment_lines`` are indices of their landmarks among the kept ones; ``projected`` are the
+    images of the 3D segments in the last state, ``samples`` places each, zero where there is none.
     """
     after = states[-1]
     num_points = len(scene.point_observations)
@@ -120,20 +120,20 @@ def image_data(scene: Scene, kept: Kept, states: Sequence[Drawable], photographs
 
 
 def _first(entries: Sequence[dict[str, Any]]) -> int:
-    """Return the image to begin with: most lines, then most points; one with a photograph where there are any."""
+    """Return the initial image: with a photograph if any, then with most lines, then with most points."""
     keys = [(bool(entry["photo"]), entry["lines_seen"], entry["points_seen"]) for entry in entries]
     return keys.index(max(keys)) if keys else 0
 
 
 def _by_image(rows: IntArray, image_idx: IntArray, num_images: int) -> list[IntArray]:
-    """Return, of these observations, those of each image."""
+    """Group observations by image."""
     order = rows[np.argsort(image_idx[rows], kind="stable")]
     bounds = np.searchsorted(image_idx[order], np.arange(num_images + 1))
     return [order[first:last].astype(np.int64) for first, last in pairwise(bounds)]
 
 
 def _projected(scene: Scene, image: int, lines: IntArray, samples: int) -> FloatArray:
-    """Return the images of 3D segments (n, 2 * samples); zeros where they are not before the camera."""
+    """Return the images of 3D segments (n, 2 * samples); zeros behind the camera."""
     found = np.zeros((len(lines), samples, 2))
     places, seen = projected_places(scene, image, lines) if len(lines) else (found, np.ones((0, samples), bool))
     rest = seen.sum(axis=1) >= 2
@@ -152,7 +152,7 @@ def _projected(scene: Scene, image: int, lines: IntArray, samples: int) -> Float
 
 
 def _frame(scene: Drawable, index: int) -> tuple[float, float, float, float]:
-    """Return left, top, width, height of the image, or of what was measured in it where the size is unknown."""
+    """Return left, top, width, height of the image, or of its measurements if the size is unknown."""
     width, height = scene.image_sizes[index]
     if width > 0 and height > 0:
         return 0.0, 0.0, float(width), float(height)

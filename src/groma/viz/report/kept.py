@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Which landmarks the page holds, and which of their observations: a page must open in a second.
+"""Landmarks and observations in a page, limited in number so that it opens within a second.
 
-Landmarks are kept whole. A line that can be picked in the scene lights up in every photograph that observes it, so all
-of its segments are in the page; where there are too many, fewer lines have segments.
+Observations are kept by landmark: a line picked in the scene is highlighted in every photograph that observes it, so
+all of its segments are in the page; if there are too many, fewer lines have segments.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def kept(scene: Scene) -> Kept:
 
 
 def places_of(rows: IntArray, count: int) -> IntArray:
-    """Return where each of ``count`` items stands among the kept rows (count,); -1 for those that are not kept."""
+    """Return the index of each of ``count`` items among the kept rows; -1 if it is not kept."""
     place = np.full(count, -1, np.int64)
     place[rows] = np.arange(len(rows))
     return place
@@ -66,7 +66,7 @@ def _member(rows: IntArray, count: int) -> BoolArray:
 
 
 def _observations(owner: IntArray, wanted: BoolArray, limit: int) -> IntArray:
-    """Return the observations of wanted landmarks; of as many landmarks, at random, as stay below the limit."""
+    """Return the observations of the given landmarks, or of a random choice of them within the limit."""
     count = np.where(wanted, np.bincount(owner, minlength=len(wanted)), 0)
     if count.sum() > limit:
         order = np.random.default_rng(0).permutation(len(wanted))

@@ -59,7 +59,7 @@ def projected_places(scene: Scene, image_idx: int, line_idx: IntArray) -> tuple[
 def observation_crop(
     picture: Picture, size: tuple[float, float], segment: FloatArray, ways: FloatArray, colour: str, width: int = 300
 ) -> str:
-    """Return an inline SVG of the surroundings of one observed segment, with what the scene says about it.
+    """Return an inline SVG of the surroundings of one observed segment, with the image of its 3D line.
 
     Parameters
     ----------

@@ -38,7 +38,7 @@ from groma.viz.report.data import scene_data
 from groma.viz.report.images import Photographs, image_data, page_photographs
 from groma.viz.report.kept import kept
 
-#: The program of the page, in order: data, drawing, what is chosen, what hands do.
+#: The scripts of the page, in order.
 SCRIPTS = (
     *("data", "vectors", "colours", "orbit", "things", "webgl", "flat"),
     *("scene", "measure", "about", "photo", "strip", "main"),
@@ -46,7 +46,7 @@ SCRIPTS = (
 
 
 class Report(Protocol):
-    """What the page reads of the report of an adjustment."""
+    """Interface to the report of an adjustment."""
 
     @property
     def history(self) -> Sequence[Any]:
@@ -66,9 +66,9 @@ class Report(Protocol):
 
 @dataclass(frozen=True)
 class PageContents:
-    """What a page says beside the scenes and the report of their adjustment."""
+    """Contents of a page besides the scenes and the report of their adjustment."""
 
-    #: Numbers of segments by what became of them, of a map, and the same in words.
+    #: Numbers of segments of a map by outcome, and the same in words.
     outcomes: Mapping[str, int] | None = None
     explanation: str = ""
     #: Sentences in a box; by default those of the report.
@@ -80,9 +80,9 @@ class PageContents:
     cards: str = ""
     #: HTML of the large numbers instead of the usual ones.
     tiles: str | None = None
-    #: What :func:`~groma.viz.report.images.page_photographs` began; by default they are read now.
+    #: Result of :func:`~groma.viz.report.images.page_photographs`; by default they are read now.
     photographs: Photographs | None = None
-    #: Covariances of ``scene_after``: what is measured on the page then has standard deviations.
+    #: Covariances of ``scene_after``, for standard deviations of measurements on the page.
     covariances: LandmarkCovariances | None = None
 
 
@@ -111,7 +111,7 @@ def write_report(
     title
         Heading of the page.
     contents
-        What else the page says.
+        Further contents.
 
     Raises
     ------
@@ -171,7 +171,7 @@ def _part(name: str) -> str:
 
 
 def _policy(script: str) -> str:
-    """Return what a browser lets the page do: run the script that groma wrote, show what lies in the page, no more."""
+    """Return the content security policy: run this script, show embedded images, nothing else."""
     digest = base64.b64encode(hashlib.sha256(f"\n{script}\n".encode()).digest()).decode()
     return (
         f"default-src 'none'; script-src 'sha256-{digest}'; style-src 'unsafe-inline'; img-src data:; "
@@ -195,7 +195,7 @@ def _iteration(step: Any) -> int:
 
 
 def _stages(numbers: Mapping[str, Any] | None) -> list[dict[str, Any]]:
-    """Return the stages of an adjustment; one where the report does not tell them apart."""
+    """Return the stages of an adjustment; a single one if the report does not list them."""
     if numbers is None:
         return []
     whole = {"loss": "", "initial_cost": numbers["initial_cost"], "first_step": 1}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Charts of a moving camera as inline SVG: its path from one side, and numbers over time."""
+"""Charts of a moving camera as inline SVG: its path in a plane, and values over time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from groma._typing import FloatArray
 from groma.viz.report import charts as _charts
 from groma.viz.report import digits as _digits
 
-#: Places of a curve that are drawn; of longer ones, the largest value of each of so many pieces.
+#: Maximum number of drawn places; longer curves are reduced to the maxima of this many pieces.
 MAX_PLACES = 1200
 #: Height of the view of a path, pixels.
 PATH_HEIGHT = (150, 420)
@@ -154,7 +154,7 @@ def _drawn(places: FloatArray, curve: Curve) -> str:
 
 
 def _thinned(times: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return at most MAX_PLACES places of a curve that keep its peaks; a piece without any number stays a gap."""
+    """Return at most MAX_PLACES places of a curve, with its peaks; pieces without numbers stay gaps."""
     if len(values) <= MAX_PLACES:
         return times, values
     bounds = np.linspace(0, len(values), MAX_PLACES + 1).astype(int)[:-1]

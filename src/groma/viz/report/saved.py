@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The report of an earlier run, from the summary that stands beside its result."""
+"""The report of an earlier run, from the ``summary.json`` of its result."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 from groma.bounded.text import read_text
 
-#: Without these it is the summary of something else.
+#: Entries without which it is another kind of summary.
 _NEEDED = ("initial_cost", "final_cost", "iterations", "seconds", "history", "termination_sentence")
 
 
@@ -20,7 +20,7 @@ _ANY = "*"
 #: Sizes of numbers, other than zero, that charts can show; and of counts.
 _LEAST, _MOST, _MOST_COUNTED = 1e-100, 1e100, 10**15
 _OBSERVED = {"determined": int, "weak": int, "undetermined": int}
-#: What the page works with: types by name; a star stands for any name, a question mark for what may be missing.
+#: Entries that the page uses: types by name; ``*`` stands for any name, ``?`` marks optional entries.
 _FORM = {
     "initial_cost": float,
     "final_cost": float,
@@ -47,7 +47,7 @@ class SavedTermination:
 
 @dataclass(frozen=True)
 class SavedReport:
-    """What :func:`groma.viz.report.page.write_report` reads of a report, from a file."""
+    """A report from a file, for :func:`groma.viz.report.page.write_report`."""
 
     numbers: Mapping[str, Any]
 
@@ -68,12 +68,12 @@ class SavedReport:
 
     @property
     def outcomes(self) -> Mapping[str, int] | None:
-        """Numbers of segments by what became of them; None where there were none."""
+        """Numbers of segments by outcome; None without segments."""
         return self.numbers.get("segments")
 
     @property
     def explanation(self) -> str:
-        """What became of the segments, in words."""
+        """The outcomes of the segments in words."""
         return str(self.numbers.get("explanation") or "")
 
     def to_dict(self) -> dict[str, Any]:
@@ -82,10 +82,7 @@ class SavedReport:
 
 
 def saved_report(folder: Path) -> SavedReport | None:
-    """Return the report that ``summary.json`` in a folder holds; None where there is none that can be used.
-
-    One that is damaged is told in a warning.
-    """
+    """Return the report in the ``summary.json`` of a folder; None, if damaged with a warning, if there is none."""
     path = folder / "summary.json"
     try:
         numbers = json.loads(read_text(path))
@@ -102,7 +99,7 @@ def saved_report(folder: Path) -> SavedReport | None:
 
 
 def _has_form(value: Any, form: Any) -> bool:
-    """Whether a value from a file is what the page works with; see :data:`_FORM`."""
+    """Whether a value from a file has a form of :data:`_FORM`."""
     if isinstance(form, list):
         return isinstance(value, list) and all(_has_form(one, form[0]) for one in value)
     if isinstance(form, dict):

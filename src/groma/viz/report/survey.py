@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Measurements of other instruments on the page: how they fit, and which are wrong, as HTML."""
+"""HTML tables of the fit and the gross errors of measurements of other instruments."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MAX_LISTED = 30
 
 
 def survey_card(numbers: Mapping[str, Any] | None) -> str:
-    """Return the cards of the entry ``survey`` of a summary; nothing where there is none."""
+    """Return the cards of the entry ``survey`` of a summary; empty without it."""
     if not numbers or not numbers.get("measurements"):
         return ""
     return _components(numbers) + _measurements(numbers) + _check_points(numbers.get("check_points") or ())

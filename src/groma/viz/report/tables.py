@@ -23,7 +23,7 @@ from groma.viz.statistics import images_of
 #: Planes, and directions, in the tables.
 MAX_LISTED_PLANES = 15
 MAX_LISTED_DIRECTIONS = 8
-#: What became of a segment, in words, and in which colour; the rest of the stages follow in greys.
+#: Words and colours of the outcomes of segments.
 _OUTCOMES = {
     "mapped": ("observes a line", "var(--line)"),
     "recovered": ("found by projecting a line", "#8fcf9f"),
@@ -44,7 +44,7 @@ _OUTCOMES = {
 
 
 def counts_of(scene: Scene, shown: Drawable) -> list[tuple[str, int]]:
-    """Return what a scene holds."""
+    """Return the counts of a scene."""
     return [
         ("images", len(shown.cam_from_world)),
         ("points", len(shown.points)),
@@ -93,7 +93,7 @@ def chart_cards(
     outcomes: Mapping[str, int] | None,
     explanation: str,
 ) -> str:
-    """Return the charts, each in a card: residuals by kind, convergence, images, tracks, what became of segments."""
+    """Return the charts, each in a card: residuals by kind, convergence, images, tracks, outcomes of segments."""
     key = '<span class="key" style="--c:var(--after)">after</span>' if before is not None else ""
     if before is not None:
         key = '<span class="key" style="--c:var(--before)">before</span>' + key
@@ -151,7 +151,7 @@ def number_tables(scene: Scene, before: Drawable | None, after: Drawable, number
 
 
 def diagnosis_card(diagnosis: Mapping[str, Any] | None) -> str:
-    """Return what a diagnosis says, the gravest first, and how many landmarks are determined."""
+    """Return the findings of a diagnosis and the numbers of determined landmarks."""
     if not diagnosis:
         return ""
     items = "".join(
@@ -173,7 +173,7 @@ def diagnosis_card(diagnosis: Mapping[str, Any] | None) -> str:
 
 
 def contributions_card(entries: Sequence[Mapping[str, Any]] | None) -> str:
-    """Return adjustments with more and more kinds of landmarks: how far the camera centres are, and a table."""
+    """Return a chart and a table of adjustments with more and more kinds of landmarks."""
     if not entries:
         return ""
     pixels = list(dict.fromkeys(name for entry in entries for name in entry["rmse_px"]))
@@ -277,7 +277,7 @@ def _plane_table(scene: Scene, after: Drawable) -> str:
 
 
 def _relation_table(scene: Scene, outcomes: Mapping[str, Mapping[str, int]]) -> str:
-    """Return how many relations of each kind there are, and what became of those that an adjustment held."""
+    """Return a table of the relations by kind, with the numbers kept and rejected by the adjustment."""
     there = num_relations(scene)
     became = {kind: [f"{outcome['held']:,}", f"{outcome['dropped']:,}"] for kind, outcome in outcomes.items()}
     rows = [

@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A tracked sequence as one self-contained HTML file.
 
-The page of :func:`groma.viz.report.page.write_report` shows the map; before its charts stand the path of the camera
-from above and from the side, its error over time where a reference is known, what was followed in each frame, and where
-the time went.
+The page of :func:`groma.viz.report.page.write_report` shows the map, preceded by the path of the camera from above and
+from the side, its error over time if there is a reference, the features tracked in each frame, and timings.
 
-*Above* is where the cameras' y axes point away from, all taken together; the view from the side looks across the
-longer extent of the path.
+*Up* is opposite to the mean y axis of the cameras; the view from the side is across the longer extent of the path.
 """
 
 from __future__ import annotations
@@ -30,7 +28,7 @@ from groma.viz.report import tables as _page_tables
 from groma.viz.report.page import PageContents, write_report
 from groma.viz.report.path_charts import Curve, legend, over_time, path
 
-#: What a frame can be besides tracked, in words, and its colour in charts.
+#: Words and colours of the statuses of frames other than tracked.
 _STATUSES = {
     "weak": ("weak", "#e8c53a"),
     "found": ("found again", "#2c6fbb"),
@@ -41,12 +39,12 @@ _STATUSES = {
 _KINDS = {"points": "var(--after)", "lines": "var(--line)", "planes": "var(--plane)"}
 #: A path is interrupted where this many times the usual time passes between two poses.
 _GAP = 3.0
-#: Times of frames are shown up to so many times what 95 of 100 stay below: the first ones may compile.
+#: Times of frames are cut off at this multiple of their 95th percentile: the first frames may compile.
 _CUT = 2.0
 
 
 class Frame(Protocol):
-    """What the page reads of a frame."""
+    """Interface to a tracked frame."""
 
     @property
     def timestamp(self) -> float:
@@ -66,7 +64,7 @@ class Frame(Protocol):
 
 
 class Track(Protocol):
-    """What the page reads of the result of a tracker."""
+    """Interface to the result of a tracker."""
 
     @property
     def trajectory(self) -> Trajectory:
@@ -109,7 +107,7 @@ def write_track_report(
     track
         Trajectory, map and statistics, such as :class:`groma.tracking.TrackResult`.
     frames
-        What became of every frame, in order of time, for the charts over time; without them these are left out.
+        All frames in temporal order, for the charts over time.
     scores
         Comparison with a reference, if there is one.
     images
@@ -203,7 +201,7 @@ def _axes(centers: FloatArray, up: FloatArray) -> FloatArray:
     spread = flat.T @ flat
     angle = float(0.5 * np.arctan2(2 * spread[0, 1], spread[0, 0] - spread[1, 1]))
     along: FloatArray = np.cos(angle) * first + np.sin(angle) * second
-    # the way it goes is to the right
+    # the end of the path is to the right of its start
     if (centers[-1] - centers[0]) @ along < 0:
         along = -along
     return np.stack([along, np.asarray(np.cross(up, along)), up])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Arrays in the form in which the page of the viewer takes them."""
+"""Arrays as the page of the viewer expects them."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from groma.viz.viewer.content import REACH
 
 
 def by_end(colours: Colours) -> Colours:
-    """Return colours (L, 3) for both ends of segments, (L, 2, 3), such that the page shows them as they are meant.
+    """Return colours (L, 3) for both ends of segments, (L, 2, 3).
 
-    The page takes the colours of the ends of segments, unlike all others, as amounts of light.
+    The page takes the colours of segment ends, unlike all others, as linear intensities.
     """
     share = np.asarray(colours, float) / 255.0
     light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
@@ -21,12 +21,12 @@ def by_end(colours: Colours) -> Colours:
 
 
 def point_size(count: int) -> float:
-    """Return the position of the slider: small where there are many."""
+    """Return the initial point size, smaller for more points."""
     return float(np.clip(np.round(2.0 * (4.0 + 2e4 / max(count, 1))) / 2.0, 4.0, 12.0))
 
 
 def camera_scale(centers: FloatArray) -> float:
-    """Return the size of drawn cameras: such that neighbours do not hide each other, within limits."""
+    """Return the size of drawn cameras at which neighbours do not overlap, within limits."""
     if len(centers) < 2:
         return 0.08 * REACH
     from scipy.spatial import KDTree

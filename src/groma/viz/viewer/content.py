@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What the viewer draws, as arrays: no server, no browser.
+"""Content of the viewer as arrays, without server or browser.
 
-Everything lies in the frame of the viewer: the middle of the scene is the origin, what is up in the photographs is +z,
-and the scene is about ten units wide. Places far from the origin keep their digits that way when they travel as single
-precision, and sizes in the viewer mean the same for every scene. Numbers for people stay in scene units and pixels.
+The frame of the viewer has its origin in the middle of the scene, +z up, and the scene is about ten units wide: places
+far from the world origin keep their digits in single precision, and sizes are independent of the scene. Displayed
+numbers are in scene units and pixels.
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ from groma.viz.statistics import LineStatistics, line_statistics
 
 #: Half the size of the scene in the frame of the viewer.
 REACH = 5.0
-#: What lines can be coloured by.
+#: Colour modes of lines.
 LINE_MODES = ("direction", "shared direction", "length", "reprojection error", "number of images", "confidence")
 
 
 @dataclass(frozen=True)
 class LineColours:
-    """Colours of the lines, and what the ends of the ramp mean."""
+    """Colours of the lines, and the labels of the ramp."""
 
     #: (L, 3)
     colours: Colours
-    #: Words at the two ends of the ramp; None where colours are no numbers.
+    #: Labels of the ends of the ramp; None for colours that do not show numbers.
     low: str | None = None
     high: str | None = None
-    #: A sentence for where they are not.
+    #: The meaning of such colours.
     meaning: str = ""
 
 
 @dataclass(frozen=True)
 class ViewContent:
-    """What the viewer draws."""
+    """The content of the viewer."""
 
     scene: Scene
     statistics: LineStatistics
@@ -54,7 +54,7 @@ class ViewContent:
     points: FloatArray
     #: By mode: (P, 3), in the same order.
     point_colours: dict[str, Colours]
-    #: (S, 2, 3) what images support of the lines, and the line (S,) of each piece.
+    #: (S, 2, 3) supported intervals of the lines, and the line (S,) of each.
     segments: FloatArray
     segment_line: IntArray
     #: K convex polygons (n, 3), and how many landmarks lie on each.
@@ -72,7 +72,7 @@ class ViewContent:
     #: (N,) vertical opening, radians, and width over height.
     camera_openings: FloatArray
     camera_aspects: FloatArray
-    #: Where to look from, and at what.
+    #: Initial viewpoint and target.
     start_position: FloatArray
     start_target: FloatArray
 
@@ -164,7 +164,7 @@ def view_content(scene: Scene) -> ViewContent:
 
 
 def ray_to_segments(origin: FloatArray, direction: FloatArray, segments: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return how far segments (L, 2, 3) are from a ray, as seen from its origin.
+    """Return angular distances of segments (L, 2, 3) from a ray, seen from its origin.
 
     Returns
     -------
@@ -179,7 +179,7 @@ def ray_to_segments(origin: FloatArray, direction: FloatArray, segments: FloatAr
     seen = (segments - origin) @ np.stack([side, np.cross(forward, side), forward]).T
     depth = seen[..., 2]
     near = 1e-6 * np.maximum(np.abs(depth).max(axis=1, initial=0.0), 1e-12)
-    # Cut off what lies behind; the rest projects to a segment in the plane at depth 1.
+    # Clip the part behind; the rest projects to a segment in the plane at depth 1.
     gap = depth[:, ::-1] - depth
     share = np.clip((near[:, None] - depth) / np.where(gap == 0.0, 1.0, gap), 0.0, 1.0)
     cut = np.where((depth < near[:, None])[..., None], seen + share[..., None] * (seen[:, ::-1] - seen), seen)
@@ -190,13 +190,13 @@ def ray_to_segments(origin: FloatArray, direction: FloatArray, segments: FloatAr
     along = np.clip(-np.einsum("li,li->l", flat[:, 0], way) / np.where(squared > 0.0, squared, 1.0), 0.0, 1.0)
     distance = np.linalg.norm(flat[:, 0] + along[:, None] * way, axis=1)
     behind = depth.max(axis=1, initial=-np.inf) <= near
-    # In the picture, inverse depth runs evenly along a segment.
+    # In the image plane, inverse depth is linear along a segment.
     inverse = (1.0 - along) / cut[:, 0, 2] + along / cut[:, 1, 2]
     return np.where(behind, np.inf, distance), 1.0 / inverse
 
 
 def _by_number(values: FloatArray, unit: str, logarithmic: bool = False, from_zero: bool = False) -> LineColours:
-    """Colour by number, from what 5 of 100 stay below to what 95 of 100 do."""
+    """Colour by number, from the 5th to the 95th percentile."""
     known = values[np.isfinite(values)]
     if not len(known):
         return LineColours(_colours.ramp(values), meaning="Not known.")
@@ -210,12 +210,12 @@ def _by_number(values: FloatArray, unit: str, logarithmic: bool = False, from_ze
 
 
 def _frame(scene: Scene) -> tuple[Similarity, FloatArray, FloatArray]:
-    """Return ``view_from_world``, and in the viewer the place to look from and the place to look at."""
+    """Return ``view_from_world``, and the initial viewpoint and target in the viewer."""
     landmarks = np.concatenate([scene.points.xyz, scene.lines.segments.reshape(-1, 3)])
     centers = scene.cam_centers_in_world
     places = landmarks if len(landmarks) else centers
     middle: FloatArray = np.asarray(np.median(places, axis=0), np.float64) if len(places) else np.zeros(3)
-    # The better part of the landmarks, and the cameras, decide on the size; a few points far away do not.
+    # The size is robust to points far away.
     reach = np.percentile(np.linalg.norm(places - middle, axis=1), 85) if len(places) else 1.0
     if len(centers):
         reach = max(reach, float(np.median(np.linalg.norm(centers - middle, axis=1))))
@@ -224,7 +224,7 @@ def _frame(scene: Scene) -> tuple[Similarity, FloatArray, FloatArray]:
     away = centers.mean(axis=0) - middle if len(centers) else np.array([1.0, 1.0, 0.0])
     away = away - (away @ up) * up
     if np.linalg.norm(away) < 0.15 * reach:
-        # Cameras around the scene: look from where the first one stands.
+        # Cameras around the scene: look from the side of the first one.
         away = centers[0] - middle if len(centers) else np.array([1.0, 1.0, 0.0])
         away = away - (away @ up) * up
     if np.linalg.norm(away) < 1e-9 * max(reach, 1e-300):

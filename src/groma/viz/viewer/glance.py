@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a running track sees, for the panel of its page: the picture with what is followed in it, and a timeline.
+"""The panel of a running track: the current picture with its tracked features, and a timeline.
 
 ``groma track`` writes both into ``OUT.work``: ``now.npz`` (picture, points, segments) and ``statuses.txt``, a row for
 every frame: time, status, numbers of points, lines and planes that agree, whether it is a keyframe.
@@ -31,7 +31,7 @@ _WORST = ("lost", "skipped", "weak", "starting", "found", "tracked")
 
 @dataclass(frozen=True)
 class Statuses:
-    """What became of N frames."""
+    """The statuses of N frames."""
 
     timestamp: FloatArray
     status: tuple[str, ...]
@@ -43,7 +43,7 @@ class Statuses:
         return len(self.status)
 
     def sentence(self, row: int = -1) -> str:
-        """Return what became of a frame, in words."""
+        """Return the status of a frame in words."""
         number = row % len(self) + 1
         parts = [counted(int(n), kind) for n, kind in zip(self.counts[row], ("points", "lines", "planes"), strict=True)]
         more = ", keyframe" if self.keyframe[row] else ""
@@ -51,7 +51,7 @@ class Statuses:
 
 
 def read_statuses(path: Path) -> Statuses:
-    """Read the rows of ``statuses.txt``; one that is not complete is left out."""
+    """Read the complete rows of ``statuses.txt``."""
     with reading(path, "list of frames"):
         rows = [(line, words) for line, words in read_words(path) if len(words) == 6]
         where = f"{path}, line "
@@ -91,7 +91,7 @@ def read_now(path: Path) -> Picture:
 
 
 def timeline(statuses: Statuses) -> str:
-    """Return all frames as an SVG: how many points and lines agree, the status as a colour, keyframes as ticks."""
+    """Return all frames as an SVG: inlier counts as heights, statuses as colours, keyframes as ticks."""
     count = len(statuses)
     if not count:
         return ""

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A running track in the browser: its path, keyframes, points, lines and planes as they come.
+"""A running track in the browser: its path, keyframes, points, lines and planes so far.
 
-``groma track`` keeps what is finished in ``OUT.work`` while it runs, and leaves ``OUT`` at its end. This module reads
-those files again whenever they change, and draws them on a viser server. The panel shows the picture of the moment with
-what is followed in it, what became of the frames, and switches.
+``groma track`` writes finished keyframes to ``OUT.work`` while it runs, and ``OUT`` at its end. This module reads these
+files whenever they change, and draws them on a viser server. The panel shows the current picture with its tracked
+features, the statuses of the frames, and switches.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 
     from groma.scene import Scene
 
-#: Seconds between two looks at the files.
+#: Seconds between two checks of the files.
 EVERY = 0.5
-#: A track that wrote nothing for so many seconds is said to be quiet.
+#: Seconds without a change after which a track is reported as quiet.
 QUIET = 20.0
 WAITING, RUNNING, FINISHED = "waiting", "running", "finished"
 _PATH, _NOW, _KEYFRAMES, _POINTS, _LINES = (40, 110, 220), (230, 60, 40), (120, 126, 134), (96, 104, 116), (20, 130, 90)
@@ -48,7 +48,7 @@ _SWITCHES = ("path", "keyframes", "points", "lines", "planes")
 
 
 class LiveView:
-    """What a track has written so far, on a server.
+    """The files of a track so far, on a server.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ class LiveView:
             node.visible = self.shown[name].value
 
     def refresh(self) -> bool:
-        """Look at the files, draw what is new, and return whether anything was."""
+        """Read changed files, draw them, and return whether there were any."""
         running = self._work.is_dir()
         if not running and not (self._output / "scene.npz").exists():
             changed = self.state != WAITING
@@ -111,7 +111,7 @@ class LiveView:
             changed = state != self.state
             self.state = state
             for name, show in self._files(running).items():
-                # A file that is not there yet, or is being replaced, is read the next time.
+                # A file that does not exist yet, or is being replaced, is read later.
                 with contextlib.suppress(GromaError, OSError, ValueError):
                     if self._is_new(folder / name):
                         show(folder / name)
@@ -120,7 +120,7 @@ class LiveView:
         return changed
 
     def _files(self, running: bool) -> dict[str, Callable[[Path], None]]:
-        """Return what is read, by name, and what is done with it."""
+        """Return the function that draws each file, by name."""
         scene: dict[str, Callable[[Path], None]] = {"scene.npz": lambda path: self._draw_scene(read_scene(path))}
         if not running:
             return {"trajectory.txt": lambda path: self._draw_path(read_tum(path).world_from_cam), **scene}
@@ -163,7 +163,7 @@ class LiveView:
         self._draw_now()
 
     def _draw_now(self) -> None:
-        """Draw the camera of the chosen frame, and move the view along with it if that is wanted."""
+        """Draw the camera of the selected frame; move the view along if it is followed."""
         if not len(self._path):
             return
         pose = self._path[min(int(self.frame_shown.value), len(self._path)) - 1]
@@ -241,7 +241,7 @@ class LiveView:
         )  # fmt: skip
 
     def _look_at(self, middle: FloatArray) -> None:
-        """Look from above and behind the first camera; pages that are open already are moved too."""
+        """Move the view of all pages above and behind the first camera."""
         start = middle + self._size * np.array([0.0, -0.8, -1.3])
         self.server.initial_camera.position, self.server.initial_camera.look_at = start, middle
         for client in self.server.get_clients().values():
@@ -269,7 +269,7 @@ class LiveView:
 
 
 def read_frames(path: Path) -> FloatArray:
-    """Poses (n, 7) world_from_cam of the frames of the map that is followed now; a row that is not complete is left."""
+    """Poses (n, 7) world_from_cam of the frames of the current submap, from complete rows."""
     with reading(path, "list of frames"):
         rows = [(line, words) for line, words in read_words(path) if len(words) == 9]
         table = np.array([finite(words, f"{path}, line {line}") for line, words in rows]).reshape(-1, 9)

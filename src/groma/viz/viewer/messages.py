@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What the panel of the viewer says, as HTML."""
+"""Messages of the panel of the viewer, as HTML."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from groma.viz.report.overlays import observation_crop, residual_top
 from groma.viz.report.tables import words
 from groma.viz.viewer.content import ViewContent
 
-#: Observations in the list of a line, and pieces of photographs with it.
+#: Listed observations of a line, and crops of photographs.
 MAX_LISTED = 40
 MAX_CROPS = 4
 HINT = "Click a line to see where it was observed."
@@ -24,7 +24,7 @@ _RAMP = "linear-gradient(90deg,#2c6fbb,#3fb6a8,#e8c53a,#d9472b)"
 
 
 def counts(scene: Scene, max_cameras: int) -> str:
-    """Return what a scene holds, and what of it is drawn."""
+    """Return the counts of a scene, and how many cameras are drawn."""
     parts = [
         ("images", scene.num_images),
         ("points", scene.num_points),

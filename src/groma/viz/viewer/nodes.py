@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A scene on a viser server: the nodes of the page, its panel, and what happens when one is used."""
+"""A scene on a viser server: the nodes of the page, its panel, and their callbacks."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from groma.viz.viewer.content import LINE_MODES, REACH, ViewContent
 if TYPE_CHECKING:
     import viser
 
-#: Points drawn at first; a slider asks for more.
+#: Points drawn at first; a slider changes the number.
 FIRST_POINTS = 100_000
-#: Cameras are objects of the page one by one; of more than this an even choice is drawn.
+#: Maximum number of drawn cameras, each an object of the page; of more, an even choice.
 MAX_CAMERAS = 400
 #: Longer side of the photographs in the cameras, pixels.
 THUMBNAIL = 256
@@ -156,9 +156,9 @@ class SceneView:
     # ------------------------------------------------------------------------------------------------------- Nodes
 
     def draw_points(self) -> None:
-        """Draw the points as the panel says."""
+        """Draw the points by the settings of the panel."""
         with self._lock:
-            # The slider may have moved on while an earlier call was at work.
+            # The slider may have moved during an earlier call.
             wanted = int(self.point_count.value), self.point_mode.value
             if wanted == self._drawn_points:
                 return
@@ -176,7 +176,7 @@ class SceneView:
             )
 
     def draw_lines(self) -> None:
-        """Draw the lines as the panel says."""
+        """Draw the lines by the settings of the panel."""
         with self._lock:
             found = self.content.line_colours(self.line_mode.value)
             kept, line = self.lines_shown(), self.content.segment_line
@@ -233,7 +233,7 @@ class SceneView:
                 node.scale = self._camera_scale * self.camera_size.value
 
     def _add_planes(self) -> None:
-        """Planes of one colour are one object of the page, so that hundreds of them stay quick to draw."""
+        """Draw planes of one colour as one object, which is fast for hundreds of planes."""
         patches = self.content.patches
         if not patches:
             return
@@ -357,13 +357,13 @@ class SceneView:
             self.selection.content = _view_words.note(_view_words.HINT)
 
     def _move_to_camera(self, event: Any) -> None:
-        """Put the viewer of the page where a photograph was taken, or back."""
+        """Move the view to the pose of a photograph, or back."""
         if event.client is None:
             return
         names = self.look_from.options
         image = names.index(self.look_from.value) - 1
         camera = event.client.camera
-        # The photograph would cover what can be seen from there, and those beside it too.
+        # Photographs would cover the view from there.
         self.shown["cameras"].value = image < 0
         with event.client.atomic():
             if image < 0:

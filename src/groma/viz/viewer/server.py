@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The server of the viewer, and who may connect to it: pages that it has served itself, under a name of this machine.
 
-A browser lets every page open a web socket to this machine, and a page can give this machine a name of its own (DNS
-rebinding). Two headers tell: ``Host`` must be a name or address that the server has, and ``Origin``, where there is
-one, must be that same host, port included. All else gets 403 before anything of the scene is sent.
+A browser lets every page open a web socket to this machine, and a page can give this machine another name (DNS
+rebinding). Two headers are checked: ``Host`` must be a name or address that the server has, and ``Origin``, where there
+is one, must be that same host, port included. All else gets 403 before anything of the scene is sent.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 #: Called with a sentence when a connection is refused.
 Say = Callable[[str], None]
-#: So many refusals are said; a page that asks again and again must not fill the terminal.
+#: Maximum number of reported refusals, so that a page that keeps trying does not fill the terminal.
 _MOST_SAID = 5
 _EVERY_ADDRESS = ("0.0.0.0", "::", "")
 _starting = threading.Lock()
@@ -65,7 +65,7 @@ def stop_server(server: viser.ViserServer) -> None:
 
 
 def silenced() -> contextlib.AbstractContextManager[Any]:
-    """Keep what the server says of itself, whatever it was told about talking, off standard output."""
+    """Suppress output of the server, which ignores its own option for that."""
     return contextlib.redirect_stdout(io.StringIO())
 
 
@@ -77,7 +77,7 @@ class Doorkeeper:
         self._said: set[str] = set()
 
     def refusal(self, hosts: list[str], origins: list[str]) -> str | None:
-        """Return why the headers ``Host`` and ``Origin`` of a request are refused, in a sentence; None: welcome."""
+        """Return the reason for which the headers ``Host`` and ``Origin`` of a request are refused; None: accepted."""
         name = _name_of(f"http://{hosts[0]}") if len(hosts) == 1 else None
         if name is None or not self._is_mine(name):
             return f"refused a request for the host {_cut(hosts)}; expected localhost or {self._host or 'an address'}."
@@ -86,7 +86,7 @@ class Doorkeeper:
         return None
 
     def note(self, sentence: str) -> None:
-        """Say a refusal, unless it was said before."""
+        """Report a refusal, unless it was reported before."""
         if self._say is not None and sentence not in self._said and len(self._said) < _MOST_SAID:
             self._said.add(sentence)
             self._say(sentence)
@@ -96,7 +96,7 @@ class Doorkeeper:
             return True
         try:
             address = ipaddress.ip_address(name)
-        except ValueError:  # a name; of this machine only where other machines were asked in
+        except ValueError:  # the name of this machine, accepted if the server listens on all addresses
             return self._host in _EVERY_ADDRESS and name == socket.gethostname().lower()
         return address.is_loopback or self._host in _EVERY_ADDRESS
 
@@ -123,7 +123,7 @@ def _cut(values: list[str]) -> str:
 
 @contextlib.contextmanager
 def _checked(doorkeeper: Doorkeeper) -> Iterator[list[bool]]:
-    """Within the block, servers of web sockets ask the doorkeeper first; viser has no place to say so itself."""
+    """Within the block, web socket servers check connections by the doorkeeper; viser has no option for that."""
     from websockets.asyncio import server as sockets
 
     serve, applied = sockets.serve, []
