@@ -179,7 +179,7 @@ def adjust(
     from groma.cli.shared import output as _output
     from groma.cli.shared.adjusting import Wanted, adjust_and_write
     from groma.cli.shared.input import check_inputs, refuse_idle
-    from groma.cli.shared.parts import PartsWanted, adjust_parts_and_write, has_company, is_parts
+    from groma.cli.shared.parts import adjust_parts_and_write, has_company, is_parts
     from groma.cli.shared.pose_graph import adjust_graph_and_write
     from groma.io.g2o import is_g2o
 
@@ -235,7 +235,7 @@ def adjust(
         line_residual=line_residual, plane_residual=plane_residual, threads=console.threads,
     ))  # fmt: skip
     if in_parts:
-        adjust_parts_and_write(source, console, options, PartsWanted(output, console.json_target, force, keep), refused)
+        adjust_parts_and_write(source, output, console, options, refused, keep, force)
         return
     wanted = Wanted(
         output,
@@ -246,7 +246,6 @@ def adjust(
         diagnosis,
         contributions,
         truth,
-        console.json_target,
         force,
         measured,
         protocol,

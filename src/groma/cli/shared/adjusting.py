@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Adjusting a scene with everything that a terminal adds: progress, files that are wanted, words at the end."""
+"""``groma adjust`` of a scene: progress, requested files, summary."""
 
 from __future__ import annotations
 
@@ -26,38 +26,37 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Wanted:
-    """What comes out of ``groma adjust``; None and False stand for what is not wanted."""
+    """The results requested from ``groma adjust``; None and False: not requested."""
 
-    #: Places of the adjusted scene, of the page and of the covariances.
+    #: Files of the adjusted scene, the page and the covariances.
     output: Path | None = None
     page: Path | None = None
     covariance: Path | None = None
-    #: What the covariances refer to, and the noise in units of that stated.
+    #: Gauge of the covariances, and the noise in units of the stated one.
     gauge: str = "auto"
     sigma0: float = 1.0
-    #: Say what the data determine; None: unless there are many images.
+    #: Diagnose what the data determine; None: up to a number of images.
     diagnosis: bool | None = None
-    #: Adjust with fewer kinds of landmarks, too, and compare with the poses of a scene.
+    #: Adjust with fewer kinds of landmarks, too, and compare the poses with those of a scene.
     contributions: bool = False
     truth: Path | None = None
-    #: Value of --json, and whether files may be replaced.
-    json_target: str | None = None
+    #: Replace existing files.
     force: bool = False
-    #: Measurements of other instruments, and where their protocol goes.
+    #: Measurements of other instruments, and the file of their protocol.
     measured: Measured = field(default_factory=Measured)
     protocol: Path | None = None
-    #: What images were read along, if not at once.
+    #: Readout direction of a rolling shutter.
     rolling_shutter: str | None = None
 
 
 def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wanted: Wanted) -> None:
-    """Adjust the scene in a file, write what is wanted and say how it went.
+    """Adjust the scene in a file, write the requested results and print a summary.
 
     Raises
     ------
     ProblemError
-        If covariances are wanted that do not exist, after everything else was written and said. Where the images fall
-        into groups a warning says so instead.
+        If requested covariances do not exist; raised after everything else was written. If the images are not
+        connected, there is a warning instead.
     """
     from groma.adjustment.covariance_files import write_covariances
     from groma.cli.shared.diagnosis import try_diagnosis
@@ -101,7 +100,7 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
         except ProblemError as error:
             reasons = why_no_covariances(result.scene, wanted.covariance)
             numbers["warnings"] += reasons
-            failure = None if reasons else error  # raised at the end, when all else is written and said
+            failure = None if reasons else error  # raised after all else is written
     if wanted.page is not None:
         _write_page(wanted.page, wanted.force, source, before, result, numbers, found)
     _say(console, numbers, compilation)
@@ -111,15 +110,15 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
     for path in (wanted.output, wanted.page, wanted.protocol, wanted.covariance if "uncertainty" in numbers else None):
         if path is not None:
             console.wrote(path)
-    if all(place is None for place in (wanted.output, wanted.page, wanted.covariance, wanted.json_target)):
+    if all(place is None for place in (wanted.output, wanted.page, wanted.covariance, console.json_target)):
         console.say("No -o given: the adjusted scene was not written.")
-    _output.write_json(wanted.json_target, numbers, wanted.force)
+    _output.write_json(console.json_target, numbers, wanted.force)
     if failure is not None:
         raise failure
 
 
 def _work_of(scene: Scene, options: AdjustOptions) -> str:
-    """Return the list of compiled functions that an adjustment is likely to need."""
+    """Return the name of the list of compiled functions that an adjustment probably needs."""
     from groma.compilation.needed import adjusting
 
     models = scene.cameras.models if options.camera_model is None else (options.camera_model,)
@@ -139,7 +138,7 @@ def _write_page(
     numbers: dict[str, Any],
     found: SceneUncertainty | None,
 ) -> None:
-    """Write the page, before and after; with standard deviations of what is measured on it if there are covariances."""
+    """Write the page, before and after; covariances give standard deviations to what is measured on it."""
     from groma.viz.report.covariances import covariances_of
     from groma.viz.report.page import PageContents, write_report
     from groma.viz.report.survey import survey_card
@@ -159,7 +158,7 @@ def _write_page(
 def _adjusted(
     before: Scene, options: AdjustOptions, wanted: Wanted, progress: Callable[[Progress], bool | None]
 ) -> tuple[Scene, AdjustResult, dict[str, Any] | None, Motions | None]:
-    """Return the scene as it went into the adjustment, the result, and what is told of measurements and motions."""
+    """Return the initial scene, the result, and the numbers of measurements and camera motions."""
     from groma.adjustment.adjust import adjust
 
     surveyed = bool(wanted.measured) or before.has_survey
@@ -190,7 +189,7 @@ def _adjusted(
 
 
 def why_no_covariances(scene: Scene, path: Path) -> list[str]:
-    """Say that images which share nothing have no covariances together, and which they are; nothing if they do."""
+    """Return a warning if the images are not connected, so that joint covariances are undefined."""
     from groma.scene.connections import connected_images
 
     groups = connected_images(scene)
@@ -210,7 +209,7 @@ def why_no_covariances(scene: Scene, path: Path) -> list[str]:
 
 
 def _say(console: Console, numbers: dict[str, Any], compilation: Compilation) -> None:
-    """Say the main numbers, what the data do not determine, and the warnings."""
+    """Print the main numbers, the diagnosis and the warnings."""
     from groma.cli.shared.diagnosis import say_diagnosis
     from groma.cli.shared.sentences import describe_uncertainty, say_adjustment, say_contributions
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""``groma adjust`` of a folder of parts, by one process or by all that a launcher started."""
+"""``groma adjust`` of a folder of parts, by one process or by the ranks of MPI."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import time
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,61 +23,57 @@ if TYPE_CHECKING:
 
 
 def has_company() -> bool:
-    """Whether a launcher of MPI started this process together with others."""
+    """Whether this is one of several ranks of MPI."""
     from groma.solver.reduce.mpi import started_as
 
     return started_as()[1] > 1
 
 
 def is_parts(path: Path) -> bool:
-    """Whether a path is a folder with parts in it."""
+    """Whether a path is a folder of parts."""
     return path.is_dir() and next(path.glob("part-*.npz"), None) is not None
 
 
-@dataclass(frozen=True)
-class PartsWanted:
-    """What comes out of ``groma adjust`` of parts."""
-
-    #: Folder of the adjusted parts.
-    output: Path | None
-    #: Value of --json, and whether files may be replaced.
-    json_target: str | None = None
-    force: bool = False
-    #: Whether parts stay in memory: ``auto``, ``always``, ``never``.
-    keep: str = "auto"
-
-
 def adjust_parts_and_write(
-    source: Path, console: Console, options: AdjustOptions, wanted: PartsWanted, refused: dict[str, Any]
+    source: Path,
+    output: Path | None,
+    console: Console,
+    options: AdjustOptions,
+    refused: dict[str, Any],
+    keep: str = "auto",
+    force: bool = False,
 ) -> None:
-    """Adjust the parts in a folder and write what is wanted; rank 0 says how it went.
+    """Adjust the parts in a folder and write them; rank 0 prints the summary.
 
     Parameters
     ----------
-    source : Path
-        The folder of the parts.
+    source, output : Path
+        Folders of the parts and of the adjusted parts.
     console : Console
-        Where rank 0 speaks.
+        Used by rank 0 only.
     options : AdjustOptions
         How to adjust.
-    wanted : PartsWanted
-        What to write.
     refused : dict
-        Options of the command that mean nothing for parts, and their values.
+        Options that do not apply to parts, with their values.
+    keep : str
+        Whether parts stay in memory: ``auto``, ``always``, ``never``.
+    force : bool
+        Replace existing files.
     """
+    from groma.adjustment.parts.together import agreed
+
     with _one_voice() as reducer:
-        numbers = _adjust(source, console, options, wanted, refused, reducer)
+        with agreed(reducer):
+            folder = _checked(source, output, refused)
+            if reducer.rank == 0:
+                _output.check_outputs(force, None, json_target=console.json_target)
+        numbers = _adjust(source, folder, console, options, keep, force, reducer)
         if reducer.rank == 0:
-            _output.write_json(wanted.json_target, numbers, wanted.force)
+            _output.write_json(console.json_target, numbers, force)
 
 
 def _adjust(
-    source: Path,
-    console: Console,
-    options: AdjustOptions,
-    wanted: PartsWanted,
-    refused: dict[str, Any],
-    reducer: Reducer,
+    source: Path, output: Path, console: Console, options: AdjustOptions, keep: str, force: bool, reducer: Reducer
 ) -> dict[str, Any]:
     """Adjust, and return the numbers."""
     from groma.adjustment.parts import adjust_parts, parts_of
@@ -90,7 +85,6 @@ def _adjust(
 
     speaks = reducer.rank == 0
     with agreed(reducer):
-        output = _checked(source, wanted, refused, reducer.rank)
         paths = parts_of(source)
         losses, solver, assembly = settings_of(paths[0], options)
     if speaks:
@@ -105,7 +99,7 @@ def _adjust(
         result = adjust_parts(
             paths, output, losses, solver,
             (lambda record: line(Progress(record.iteration, options.max_iterations, record.cost))) if speaks else None,
-            force=wanted.force, keep=wanted.keep, reducer=reducer, **assembly,
+            force=force, keep=keep, reducer=reducer, **assembly,
         )  # fmt: skip
     if not speaks:
         return {}
@@ -122,9 +116,8 @@ def _adjust(
     return numbers
 
 
-def _checked(source: Path, wanted: PartsWanted, refused: dict[str, Any], rank: int) -> Path:
-    """Refuse early what cannot be done; return where parts are written."""
-    output = wanted.output
+def _checked(source: Path, output: Path | None, refused: dict[str, Any]) -> Path:
+    """Validate the options; return the folder for the adjusted parts."""
     for name, value in refused.items():
         if value:
             raise InputError(f"{name} is for whole scenes; {source} is a folder of parts. Leave it out.")
@@ -143,14 +136,12 @@ def _checked(source: Path, wanted: PartsWanted, refused: dict[str, Any], rank: i
         raise InputError(f"{output} is a file; parts are written into a folder. Choose another name.")
     if not output.absolute().parent.is_dir():
         raise InputError(f"Cannot write {output}: the folder {output.absolute().parent} does not exist. Make it first.")
-    if rank == 0:
-        _output.check_outputs(wanted.force, None, json_target=wanted.json_target)
     return output
 
 
 @contextmanager
 def _one_voice() -> Iterator[Reducer]:
-    """Yield the reducer of this process. What goes wrong is said once, all ranks end, and none waits for another."""
+    """Yield the reducer of this process. An error is printed once and ends all ranks."""
     from groma.adjustment.parts.together import ToldByAllError
     from groma.solver.reduce.mpi import Ranks, reducer_of_launcher, started_as
 
@@ -159,7 +150,7 @@ def _one_voice() -> Iterator[Reducer]:
     except GromaError:
         if started_as()[0] == 0:
             raise
-        raise typer.Exit(1) from None  # rank 0 says it
+        raise typer.Exit(1) from None  # rank 0 prints it
     try:
         yield reducer
     except ToldByAllError:
