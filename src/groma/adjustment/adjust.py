@@ -171,7 +171,7 @@ def adjust(
 
 
 def _settled(scene: Scene, options: AdjustOptions, progress: Callable[[Progress], bool | None] | None) -> AdjustResult:
-    """Adjust a scene that begins and ends where measurements of other instruments fit best."""
+    """Adjust a scene that is first and last placed where measurements of other instruments fit best."""
     if not (scene.is_tied and options.refine_poses):
         return _adjusted(scene, options, progress)
     result = _adjusted(settled(scene), options, progress)
@@ -309,7 +309,7 @@ def _is_bal(scene: Scene) -> bool:
 
 
 def losses_of(scene: Scene, options: AdjustOptions) -> list[Loss]:
-    """Return the losses to solve with, one after the other."""
+    """Return the sequence of losses to solve with."""
     if options.loss == "none" or (options.loss == "auto" and _is_bal(scene)):
         with_lines = options.lines and scene.num_line_observations > 0
         return [Trivial(), Trivial()] if with_lines else [Trivial()]
@@ -352,7 +352,7 @@ def stage_tolerance(loss: Loss) -> float:
 
 
 def damping_after(reports: list[SolveReport], loss: Loss) -> float | None:
-    """Plain least squares goes on as boldly as it ended; another loss begins anew."""
+    """Plain least squares keeps the last damping; another loss starts with the initial one."""
     if not reports or not reports[-1].history or not isinstance(loss, Trivial):
         return None
     return reports[-1].history[-1].damping

@@ -84,7 +84,7 @@ class Assembly:
     problem: Problem
     #: Sentences about observations that were left out.
     notes: tuple[str, ...]
-    #: Where the factors come from, in their order: the names of terms, and what a term says of each.
+    #: The origins of the factors, in their order: names of terms, with what a term records about each.
     terms: tuple[str, ...] = ()
     groups: tuple[Group, ...] = ()
     #: How far from the middle of segments lines are measured, in half lengths.
@@ -221,7 +221,7 @@ def first_camera_gauge(
     scene: Scene, count: IntArray | None = None, is_metric: bool | None = None, first: int | None = None
 ) -> BoolArray:
     """Hold the first frame, or a given one, and of the frame farthest from it the translation along the line between
-    the two; this unless measurements tell the scale.
+    the two; this unless measurements determine the scale.
 
     Where other instruments measured something, only what they leave open is held.
 
@@ -233,7 +233,7 @@ def first_camera_gauge(
     scene : Scene
         The poses.
     count, is_metric : (F,) int, bool, optional
-        Observations of each frame, and whether measurements tell the scale; where not given, those of the scene.
+        Observations of each frame, and whether measurements determine the scale; by default those of the scene.
     first : int, optional
         The frame that is held; by default the first with half of the usual number of observations.
     """

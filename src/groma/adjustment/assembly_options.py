@@ -22,7 +22,7 @@ PLANE_RESIDUALS = ("normal_offset", "quaternion")
 
 @dataclass(frozen=True)
 class RightTurnPrior:
-    """What is known of the small rotation that turns right cameras away from where their columns say they look."""
+    """The prior of the small rotation of right cameras from their rectified orientation."""
 
     #: (3,) angles about x, y and z (pitch, yaw, roll), radians.
     angles: FloatArray
@@ -52,7 +52,7 @@ class AssemblyOptions:
     refine_principal_point: bool = False
     #: Estimate where cameras sit on their rig.
     refine_rigs: bool = False
-    #: Estimate how the right cameras of stereo pairs are turned, all alike, from what is known beforehand. None:
+    #: Estimate the common rotation of the right cameras of stereo pairs, with this prior. None:
     #: rectified pairs are right as they are.
     right_turn: RightTurnPrior | None = None
     #: How points move: ``auto``, far ones linearly in their inverse depth; or ``euclidean``.

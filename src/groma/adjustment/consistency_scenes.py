@@ -46,7 +46,7 @@ def drawn(num_images: int, noise_px: float, rng: np.random.Generator, relations:
 
 
 def _related(scene: Scene, rng: np.random.Generator) -> Scene:
-    """Give directions to the lines on no plane, and move everything off what it lies on by its noise."""
+    """Give directions to the lines on no plane, and move everything by the noise of its relations."""
     on_plane, on_line = scene.relations.line_on_plane, scene.relations.point_on_line
     loose = np.setdiff1d(np.arange(scene.num_lines), on_plane[:, 0])
     vectors = rng.normal(size=(NUM_DIRECTIONS, 3))

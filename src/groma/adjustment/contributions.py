@@ -20,13 +20,12 @@ from groma.evaluation.poses import evaluate_poses
 from groma.scene import Relations, Scene
 from groma.scene.checks import check_scene_given
 
-#: What is added, one after the other.
+#: Kinds in the order in which they are added.
 KINDS = ("points", "lines", "planes and directions", "points on lines")
 #: With more images than this the standard deviations are left out (cost: they take memory with the square of the
 #: images).
 MAX_IMAGES = 300
-#: Where a distribution over the images is told: so many of a hundred are below (convention: quartiles, and the ends of
-#: a box plot).
+#: Percentiles of reported distributions over the images (convention: quartiles, and the ends of a box plot).
 PERCENTILES = (5, 25, 50, 75, 95)
 
 
@@ -88,7 +87,7 @@ def contributions(
     reference : Scene, optional
         The reference scene; images are matched by name.
     progress : callable, optional
-        Called with what is added, before each adjustment.
+        Called with the added kind before each adjustment.
 
     Returns
     -------
@@ -119,7 +118,7 @@ def contributions(
 
 
 def _variants(scene: Scene, options: AdjustOptions) -> list[tuple[str, Scene, AdjustOptions]]:
-    """Return what is added, the scene with the relations so far, and the options, for each kind that is there."""
+    """Return, for each kind in the scene, its name, the scene with the relations so far, and the options."""
     all_of = scene.relations
     with_lines = options.lines and scene.num_line_observations > 0
     with_planes = options.planes and scene.num_planes + scene.num_directions > 0
@@ -180,7 +179,7 @@ def _percentiles(values: FloatArray) -> tuple[float, ...]:
 
 
 def _center_sigma(result: AdjustResult) -> tuple[float | None, str, dict[str, int]]:
-    """Return the median standard deviation of the camera centres, why there is none, what is unobservable by kind."""
+    """Return the median standard deviation of camera centres, or why there is none, and unobservable counts."""
     if result.scene.num_images > MAX_IMAGES:
         return None, f"more than {MAX_IMAGES} images", {}
     try:

@@ -15,7 +15,7 @@ Array            Shape          Content
 ``gauge``        ()             ``inner`` or ``held``, and in ``sigma0`` the factor that was applied
 ================ =============  ======================================================================================
 
-Scene units and radians; NaN for what is not observable.
+Scene units and radians; NaN: unobservable.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def write_covariances(
     uncertainty : SceneUncertainty
         As :func:`groma.uncertainty` returns it.
     force : bool
-        Replace what is there.
+        Replace an existing file.
 
     Raises
     ------

@@ -15,7 +15,7 @@ from groma.scene.checks import check_scene_given
 from groma.scene.local_frame import local_frame
 from groma.solver.observability.diagnosis import Diagnosis, diagnose
 
-#: Larger scenes are diagnosed by commands only when asked for (cost: time).
+#: Commands diagnose larger scenes on request only (cost: time).
 MANY_IMAGES = 300
 
 
@@ -65,7 +65,7 @@ def diagnose_scene(
 
 
 def _held_by_measurements(found: Diagnosis) -> Diagnosis:
-    """Return what is said where measurements hold the frame, too weakly beside the images for rounding to leave it."""
+    """Return the message for measurements that hold the frame so weakly that it is lost in rounding errors."""
     sentences = {
         "determined": "Everything is determined by the data.",
         "free_motions": "The frame is held by the measurements alone, which weigh little beside the images.",

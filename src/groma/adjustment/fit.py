@@ -46,7 +46,7 @@ def noise_of(squares: FloatArray, redundancy: FloatArray | float = 1.0) -> float
 def inliers(
     before: Mapping[str, FloatArray], after: Mapping[str, FloatArray], redundancy: Mapping[str, FloatArray]
 ) -> dict[str, dict[str, Any]]:
-    """Return what is told of inliers by kind of landmark.
+    """Return the statistics of inliers by kind of landmark.
 
     Parameters
     ----------

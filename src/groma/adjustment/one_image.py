@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The problem of one image before landmarks that are held, as :mod:`groma.adjustment.assemble` makes it of a scene.
 
-A photograph that is localised asks for several of them, and the tables of a scene, with their checks, take longer than
+Localising a photograph takes several of them, and the tables of a scene, with their checks, take longer than
 the factors.
 """
 

@@ -166,7 +166,7 @@ class AdjustResult:
         Parameters
         ----------
         diagnosis : Diagnosis, optional
-            What the data determine: :meth:`diagnose`. With it, how well the cameras are known is told too.
+            What the data determine: :meth:`diagnose`. With it, the uncertainty of the cameras is included.
         contributions : sequence of Contribution
             The same adjustment with fewer kinds of landmarks: :func:`groma.contributions`.
         """

@@ -37,7 +37,7 @@ from groma.scene import CameraMotions, Scene
 from groma.scene.motions import COLUMNS, ROWS
 from groma.solver.covariance.marginals import Covariances
 
-#: What is said where motions are left out.
+#: The message where motions are left out.
 NOT_ROLLING = (
     "The images show next to no rolling shutter: motions of the cameras explain less than a tenth of the residuals' "
     "variance, and would stand for errors of the calibration. The images count as taken at once."
@@ -86,18 +86,18 @@ GATES = RollingShutterGates()
 
 @dataclass(frozen=True, eq=False)
 class Motions:
-    """What an adjustment says of motions during the readout."""
+    """Estimated motions during the readout."""
 
     #: (N, 6) motions, and (N, 6) the share of each that the images determine, from 0 to 1.
     motion: FloatArray
     redundancy: FloatArray
-    #: Standard deviations of shifts (scene units) and turns (radians) about what is expected.
+    #: Standard deviations of shifts (scene units) and turns (radians) about the expected ones.
     sigma: tuple[float, float]
     #: Share of the motion between neighbouring images that is expected; 0 where they are no sequence.
     share: float
     #: Largest angle between the directions of readout of two images, radians.
     spread: float
-    #: Share of the residuals' variance that they explain, against images that were taken at once; None: not asked.
+    #: Share of the residuals' variance that they explain, against a global shutter; None: not computed.
     explained: float | None = None
     #: Whether they explain so little that the result is without them.
     left_out: bool = False
@@ -166,7 +166,7 @@ class RollingShutterResult:
 
 
 def with_rolling_shutter(scene: Scene, along: str = "rows") -> Scene:
-    """Return a scene all of whose images were read row by row, with motions that begin at zero.
+    """Return a scene all of whose images have a rolling shutter, with initial motions of zero.
 
     Parameters
     ----------
@@ -240,7 +240,7 @@ def adjust_rolling_shutter(
 
 
 def motions_of(scene: Scene, problem: Problem | None) -> Motions:
-    """Return what an adjusted scene says of motions during the readout, and how well to expect them the next time."""
+    """Return the motions of an adjusted scene, and their prior for the next adjustment."""
     table = scene.camera_motions
     share_of = _redundancy(problem, table)
     known = np.maximum(share_of, 0.05)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""An adjustment under several losses, one after the other: the factors of a stage, and one report of all."""
+"""An adjustment under a sequence of losses: the factors of a stage, and one report of all."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class StageGates:
 #: The defaults.
 STAGES = StageGates()
 
-#: Factors that keep the loss they were made with: what is measured by other instruments than the cameras.
+#: Factors that keep their own loss: measurements of other instruments.
 OWN_LOSS = (
     "pose_prior", "position_prior", "vector_prior", "distance", "on_known_plane", "camera_direction", "known_direction",
 )  # fmt: skip
@@ -66,7 +66,7 @@ def with_loss(
     """Return a problem under a loss; priors keep theirs.
 
     Relations between landmarks have a noise of their own, and a given loss or the plain scale. Segments have the same
-    loss as points, bent at so many times its scale.
+    loss as points, with this multiple of its scale.
     """
     if relation_loss is None:
         relation_loss = make_loss(loss.name, RELATION_SCALES[loss.name]) if loss.name in RELATION_SCALES else loss
@@ -83,7 +83,7 @@ def with_loss(
 
 
 def stage_entries(stages: list[Loss], reports: list[SolveReport]) -> tuple[dict[str, Any], ...]:
-    """Return what a report says of each stage: its loss, its cost at the start, and the number of its first step."""
+    """Return the entries of a report about the stages: loss, initial cost, and number of the first step."""
     entries, first_step = [], 1
     for loss, report in zip(stages, reports, strict=False):
         entries.append({"loss": loss.name, "initial_cost": report.initial_cost, "first_step": first_step})

@@ -25,7 +25,7 @@ from groma.solver.covariance.marginals import Covariances
 
 @dataclass(frozen=True)
 class SceneUncertainty:
-    """Covariances of a scene. NaN for what is unobservable, zero where it is held."""
+    """Covariances of a scene; NaN: unobservable, zero: held."""
 
     #: Frame that the covariances refer to: ``inner``, ``held`` or ``measured``.
     gauge: str
@@ -45,7 +45,7 @@ class SceneUncertainty:
     planes: FloatArray
     #: (D, 3, 3) of the directions.
     directions: FloatArray
-    #: Identifiers of what is unobservable, by kind: ``points``, ``lines``, ``planes``, ``directions``, and the rows
+    #: Identifiers of unobservable landmarks, by kind: ``points``, ``lines``, ``planes``, ``directions``, and the rows
     #: of ``frames``. Their covariances are NaN, and all others are not affected.
     undetermined: dict[str, IntArray]
     #: For joint covariances and derived quantities: groups are ``frames``, ``points``, ``lines``, ``planes``. Of a
@@ -98,7 +98,7 @@ def uncertainty(
         noise is not to be believed.
     problem : Problem, optional
         The problem already made from the scene, at its solution. For ``inner`` its frames are freed; for ``held`` the
-        first camera and the scale are held unless the problem holds something of its own.
+        first camera and the scale are held unless the problem has held variables.
 
     Returns
     -------
@@ -110,7 +110,7 @@ def uncertainty(
     InputError
         If the gauge is not known.
     ProblemError
-        If the poses are not determined; :func:`groma.adjustment.diagnosis.diagnose_scene` says what. Landmarks may be
+        If the poses are not determined; see :func:`groma.adjustment.diagnosis.diagnose_scene`. Landmarks may be
         unobservable.
     """
     check_scene_given(scene)

@@ -2,5 +2,5 @@
 """Graphs: cameras and what was measured between them, without landmarks.
 
 In come poses, or similarities where scales drift, and motions between them with their noise; they are adjusted,
-under a robust loss where asked for; out come cameras, and how far each motion is from them.
+optionally under a robust loss; out come cameras, and how far each motion is from them.
 """

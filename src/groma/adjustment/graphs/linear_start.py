@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Poses of a graph from two linear systems, whatever the poses that it begins with.
+r"""Poses of a graph from two linear systems, without initial poses.
 
 With the measured motions :math:`(Z_{ij}, z_{ij})` first the rotations, as matrices without constraints,
 
@@ -79,7 +79,7 @@ def _rows(ends: tuple[IntArray, IntArray], blocks: tuple[FloatArray, FloatArray]
 
 
 def _solved(matrix: csc_array, wanted: FloatArray, known: FloatArray, free: BoolArray) -> FloatArray:
-    """Return the unknowns (N, 3) for which the matrix gives nearly what is wanted; those not free stay as known."""
+    """Return the least-squares solution (N, 3) of a linear system with some unknowns held."""
     from scipy.sparse.linalg import splu
 
     result = known.copy()

@@ -38,7 +38,7 @@ from groma.solver.options import SolverOptions
 from groma.solver.report import Iteration, SolveReport
 from groma.solver.solve import solve
 
-#: Where a robust loss begins to bend unless the caller says so, in standard deviations: the length that the error of a
+#: Default scale of a robust loss, in standard deviations: the length that the error of a
 #: right motion (six numbers) exceeds once in a hundred (derived from the chi-square distribution of six).
 LOSS_SCALE = 4.1
 #: Increments (rho, omega) of cam_from_world that leave the plane z = 0.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 r"""Adjustment of a graph of similarities: what a pose graph is for cameras whose scale drifts.
 
-The map of a single camera has no unit of its own: the scale that it began with drifts from keyframe to keyframe. Each
+A monocular map has no unit of length: its scale drifts from keyframe to keyframe. Each
 camera then is a similarity :math:`S` (``cam_from_world``), whose scale is the length of the world's unit in that of the
 camera. With the measured :math:`Z_{ij}` (``first_from_second``: poses with scale 1 between neighbours, and a scale
 where a place was recognised) it minimises
@@ -74,7 +74,7 @@ def adjust_similarity_graph(
     loss: Loss | None = None,
     options: SolverOptions | None = None,
 ) -> SimilarityGraphResult:
-    """Adjust cameras, each with a scale of its own, to the similarities measured between them.
+    """Adjust cameras, each with a scale, to the similarities measured between them.
 
     Parameters
     ----------

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What residuals tell about a model that does not fit: a lens with distortion that it lacks, a rig that moves."""
+"""Model errors shown by residuals: unmodelled lens distortion, rigs that are not rigid."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Calibrations that cannot be those of the images: said before anything is adjusted with them."""
+"""Calibrations that cannot be those of the images, recognised before an adjustment."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def refuse_focal_lengths(scene: Scene) -> None:
 def doubtful_cameras(scene: Scene) -> tuple[str, ...]:
     """Return sentences about cameras of unknown size, and about those whose observations lie outside their images.
 
-    BAL files have no image sizes; nothing is said of their cameras.
+    BAL files have no image sizes; their cameras are not checked.
     """
     cameras = scene.cameras
     used = _used(scene) & np.array([name != "BAL" for name in cameras.models], bool)

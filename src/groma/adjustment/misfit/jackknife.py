@@ -34,7 +34,7 @@ from groma.problem.residuals import jacobians_of, residuals_of, root_matrices
 from groma.solver.covariance.marginals import Covariances
 from groma.solver.linear.blas import one_blas_thread
 
-#: What is left out, one after the other, and what only relations refer to.
+#: Landmarks that are left out in turn, and those of relations only.
 _LANDMARKS, _STRUCTURE = ("points", "lines"), ("planes", "directions")
 #: Numbers in the largest arrays of one batch of landmarks, and batches that are worked on before they are added
 #: (cost: memory).

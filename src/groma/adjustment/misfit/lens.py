@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Lens distortion that the cameras do not model, recognised by what it leaves in the residuals of points.
+r"""Lens distortion that the cameras do not model, recognised in the residuals of points.
 
 In comes an adjusted problem; out comes what is missing, or nothing. Two tests, the second where the first finds some:
 
@@ -131,7 +131,7 @@ def unmodelled_distortion(
 
 
 def begin_lens_test(problem: Problem, threads: int | None, residuals: Residuals) -> Callable[[], Lens | None]:
-    """Begin what :func:`unmodelled_distortion` does, and return what gives its result; other work goes on meanwhile."""
+    """Start :func:`unmodelled_distortion` in the background; return a function that waits for its result."""
     return begin(partial(unmodelled_distortion, problem, threads, residuals=residuals))
 
 

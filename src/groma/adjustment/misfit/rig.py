@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Cameras on a rig that do not sit where they are held, or do not look at the same moment.
+"""Rigs whose cameras have other poses than the held ones, or are not synchronised.
 
 In comes an adjusted problem of images on rigs; out comes a sentence, or none. From where the adjustment ended a few
 steps are taken with more freedom: the places of the cameras on their rigs, if these were held; then a pose of its own
@@ -110,7 +110,7 @@ def _with_free_sensors(problem: Problem, reference: BoolArray) -> Problem:
 
 
 def _with_free_images(problem: Problem, reference: BoolArray) -> Problem:
-    """Return the problem with a place of its own for every pair of a frame and a sensor."""
+    """Return the problem with a pose on the rig for every pair of a frame and a sensor."""
     old = problem.variables[SENSORS]
     pairs = [np.column_stack([f.extrinsics.index, f.pose.index]) for f in _seen(problem) if f.extrinsics is not None]
     every, of = np.unique(np.vstack(pairs), axis=0, return_inverse=True)

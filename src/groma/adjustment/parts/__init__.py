@@ -2,7 +2,7 @@
 """Adjustment of a scene that is too large for memory or for a machine, in parts on disk.
 
 A part is a groma archive (``.npz``). All parts have the same cameras, images, poses, planes and directions; each has
-points and lines of its own, with all their observations and relations. Parts belong to processes, one or many; see
+some of the points and lines, with all their observations and relations. Parts belong to processes, one or many; see
 :mod:`groma.solver.reduce.shards`. ``cut.py`` makes parts of a scene, and a scene of parts, ``opened.py`` makes
 variables of parts, ``adjust.py`` solves and writes them, and ``checkpoint.py`` keeps where it stands.
 """

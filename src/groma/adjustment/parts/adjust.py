@@ -62,16 +62,16 @@ def adjust_parts(
 ) -> PartsResult:
     """Adjust the cameras, points, lines, planes and directions of all parts together.
 
-    A run that was killed goes on after its last step, if it is started again with the same parts, output and options.
+    A killed run resumes after its last step if it is started again with the same parts, output and options.
 
     Parameters
     ----------
     parts : sequence of path
-        Archives with the same cameras, images and planes, each with points and lines of its own.
+        Archives with the same cameras, images and planes, and disjoint points and lines.
     output : path
         Folder for the adjusted archives, which keep their names.
     loss : Loss or sequence of Loss, optional
-        Robust loss, in standard deviations, or several, one after the other; squares if not given.
+        Robust loss, in standard deviations, or a sequence of losses; by default least squares.
     options : SolverOptions, optional
         Steps, tolerances, threads.
     progress : callable, optional

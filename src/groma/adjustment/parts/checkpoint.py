@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Where an adjustment in parts stands, on disk after every accepted step, so that a killed run goes on.
+"""The state of an adjustment in parts, on disk after every accepted step, so that a killed run resumes.
 
 In the folder ``.checkpoint`` of the result lie ``state.npz``, written by rank 0 (cameras, damping, history), and of
 every part two files of its landmarks, written by its owner. A step writes the older of the two; then, when all
 processes have written theirs, ``state.npz``, which says which of the two is valid. So whenever the run is killed, what
 ``state.npz`` says is complete. Every file is replaced in one go. There are never more than these, and none depends on
-the number of processes, so that a run may go on with more or fewer of them.
+the number of processes, so that a run may resume with more or fewer of them.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Checkpoint:
     folder : Path
         Where; made by the first step.
     key : str
-        Says what is adjusted and how: a checkpoint with another one is not taken.
+        Identifies parts and options: a checkpoint with another one is not used.
     opened : OpenParts
         The parts of this process.
     reducer : Reducer
@@ -162,7 +162,7 @@ def _save(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Say of whatever goes wrong what is to be done."""
+    """Turn any error into one with a remedy."""
     try:
         with reading(path, "checkpoint"):
             yield

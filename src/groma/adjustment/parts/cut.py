@@ -56,7 +56,7 @@ def write_parts(
     folder : path
         Where; made where it is missing.
     observations : int
-        About so many in each part.
+        Approximate number in each part.
     force : bool
         Replace archives that exist in ``folder``.
 
@@ -126,7 +126,7 @@ def num_ties_cut(scene: Scene, observations: int = PART_SIZE) -> int:
 
 
 def _without_what_counts_once(scene: Scene) -> Scene:
-    """Return a scene without what is in the first part alone: it would count once per part."""
+    """Return a scene without the tables that are in the first part only, since they would count once per part."""
     once: dict[str, list[int]] = {kind: [] for kind in ("lines_meeting", *ANGLES)}
     relations = scene.relations.take(**once)
     return scene.replace(relations=relations, **{name: type(getattr(scene, name))() for name in ONCE})

@@ -54,5 +54,5 @@ def _limit_of_group(folder: Path = Path("/sys/fs/cgroup")) -> float | None:
         place = folder / group.lstrip("/")
         place = place if (place / "memory.max").exists() else folder
         return float(int((place / "memory.max").read_text()) - int((place / "memory.current").read_text()))
-    except (OSError, ValueError):  # no group, or no limit: the file then says "max"
+    except (OSError, ValueError):  # no group, or no limit ("max")
         return None

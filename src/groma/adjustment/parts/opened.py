@@ -221,7 +221,7 @@ def _read(path: Path, near: Similarity | None) -> Scene:
 
 
 def _facts(scene: Scene, options: AssemblyOptions, made: Assembly) -> dict[str, Any]:
-    """Return what all processes must know of a part."""
+    """Return the facts about a part that all processes need."""
     squares = squared_residuals_px(made)
     return {
         "points": scene.num_points if "points" in made.problem.variables else 0,

@@ -30,7 +30,7 @@ from groma.solver.report import Iteration, SolveReport
 from groma.solver.solve import Progress
 from groma.solver.steps import States
 
-#: Squared residuals are counted by their binary logarithm, in so many bins from one end to the other, for a median that
+#: Histogram of squared residuals by their binary logarithm (number and bounds of bins), for a median that
 #: all processes agree on (cost: a bin is 1.4 per cent wide, less than a median of parts is known to).
 BINS, BIN_RANGE = 4096, (-40.0, 40.0)
 #: Of every part and kind of landmark: the sum of squared residuals, pixels, and their number.
@@ -135,7 +135,7 @@ class Run:
     def _settled(self, states: States, loss: Loss, last: bool, steps: int) -> tuple[States, bool]:
         """Bring lines back that settled in wrong places, and return whether any process did; cameras are held.
 
-        Which lines fit worse than usual is told by the lines of their part.
+        Lines are compared with those of their part.
         """
         robust = not isinstance(loss, Trivial)
         if not self.opened.has_lines or (last and not robust) or not steps:

@@ -24,7 +24,7 @@ def settings_of(
 ) -> tuple[list[Loss], SolverOptions, dict[str, Any]]:
     """Return the losses, the options of the solver and those of the assembly that :func:`adjust_parts` takes.
 
-    What a choice of its own depends on, such as the kind of the cameras, is that of the given part.
+    Automatic choices, such as those by the kind of cameras, are made for the given part.
     """
     scene = read_archive(part)
     losses = losses_of(scene, options)

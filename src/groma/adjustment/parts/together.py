@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What processes tell each other besides sums: facts, and that one of them cannot go on."""
+"""Communication between processes besides sums: facts, and errors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from groma.solver.reduce.contract import Reducer
 
 
 class ToldByAllError(InputError):
-    """A mistake that all processes know of; one of them need say it."""
+    """An error that all processes have; one of them reports it."""
 
 
 def exchange(reducer: Reducer, facts: Any) -> list[Any]:

@@ -99,7 +99,7 @@ def _indices(factor: Factor) -> dict[str, IntArray]:
 
 
 def _label_of(factor: Factor, cluster: dict[str, IntArray]) -> IntArray:
-    """Return the cluster of each factor; -1 for none, or if it ties a cluster to what is outside of it."""
+    """Return the cluster of each factor; -1 for none, or for a factor that reaches outside of its cluster."""
     labels = [cluster[ref.group][ref.index] for _, ref in factor.references() if ref.group in cluster]
     if not labels:
         return np.full(len(factor), -1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""From files of measurements to tables of a scene that lies where they say."""
+"""From files of measurements to tables of a scene in their frame."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What an adjustment says of poses that were given with the photographs, whose noise was estimated beside them."""
+"""Tests of poses that were given with the photographs and whose noise was estimated."""
 
 from __future__ import annotations
 

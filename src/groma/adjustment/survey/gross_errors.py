@@ -44,12 +44,12 @@ def without_gross_errors(
     result : AdjustResult
         An adjustment with all measurements.
     adjust_again : callable
-        Adjusts a scene that differs in what is rejected.
+        Adjusts a scene with other rejected measurements.
 
     Returns
     -------
     result, reliability
-        The last adjustment, of a scene whose tables say what is rejected, and what it says of the measurements; None
+        The last adjustment, of a scene whose tables mark rejected rows, and the tests of the measurements; None
         where the poses are not determined.
     """
     found = reliability_of(result.scene, result.problem)
@@ -79,7 +79,7 @@ def without_gross_errors(
 
 
 def _worst(scene: Scene, wrong: dict[tuple[str, int], float]) -> set[tuple[str, int]]:
-    """Return the worst of each table, and one mark of a point: the others may only look wrong beside them."""
+    """Return the worst of each table, and one mark of a point; the others may be affected by these."""
     most = {table: max(size for (of, _), size in wrong.items() if of == table) for table, _ in wrong}
     found: dict[tuple[str, int], tuple[str, int]] = {}
     for place, size in sorted(wrong.items(), key=lambda one: -one[1]):
@@ -128,7 +128,7 @@ def _no_longer_checked(before: Reliability | None, after: Reliability, size: flo
 
 
 def _at_full_weight(problem: Problem | None) -> Problem | None:
-    """Return a problem in which no loss lowers the weight of a measurement: what it could check, whatever it says."""
+    """Return the problem with full weights of the measurements, for their redundancy numbers."""
     if problem is None:
         return None
     return problem.with_losses([

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Where measurements say that a scene is, before anything is adjusted.
+"""The similarity that places a scene by measurements, before any adjustment.
 
 Places determine a similarity that most of them agree on. Without places, known directions turn the scene, known planes
-turn and lift it, distances scale it; whatever none of them tells stays as it is.
+turn and lift it, distances scale it; the rest of the similarity is left unchanged.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from groma.scene.survey import Kind
 
 @dataclass(frozen=True, eq=False)
 class Placing:
-    """Where a scene goes."""
+    """The placement of a scene."""
 
     similarity: Similarity
     #: How well places fit; None where none determined the similarity.
@@ -39,7 +39,7 @@ class Placing:
 
 
 def placing(before: Scene, scene: Scene, survey: Survey, frame: WorldFrame, notes: list[str]) -> Placing:
-    """Return where the measurements say that a scene is.
+    """Return the placement of a scene by measurements.
 
     Parameters
     ----------
@@ -118,14 +118,14 @@ def _correspondences(scene: Scene) -> tuple[FloatArray, FloatArray, Sequence[str
 
 
 def _by_orientations(scene: Scene, fit: RobustSimilarity, source: FloatArray, target: FloatArray) -> RobustSimilarity:
-    """Return a similarity to places on a line, turned about it as measured poses say."""
+    """Return a similarity to places on a line, with the rotation about it from measured poses."""
     table = scene.camera_poses
     found = pose_alignment(scene.cam_from_world[table.image_idx], table.cam_from_world).similarity
     return replace(fit, similarity=found, residuals=target - found.points(source), on_line=False)
 
 
 def _is_there(scene: Scene, fit: RobustSimilarity) -> bool:
-    """Whether poses from elsewhere place the scene where the measurements do, to within what both know."""
+    """Whether given poses and measurements place the scene alike, within their uncertainty."""
     priors = scene.pose_priors
     if not len(priors):
         return False

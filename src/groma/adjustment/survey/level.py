@@ -35,7 +35,7 @@ class LevelGates:
 
 
 GATES = LevelGates()
-#: Axes that files of cameras have by mistake, and what to say of them.
+#: Axes that files have by mistake, and messages about them.
 _OTHER_AXES = {
     "the axes of OpenGL (y up, looking along -z)": np.diag([1.0, -1.0, -1.0]),
     "axes turned by 90 degrees (photographs stored turned?)": np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]),

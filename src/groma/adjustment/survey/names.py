@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What to say where names of a file are not those of the scene."""
+"""Messages about names of a file that are not in the scene."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def require_some(found: IntArray, wanted: Sequence[str], known: Sequence[str], s
     Raises
     ------
     InputError
-        It names the first one, and what it is most like.
+        It names the first one and the most similar known name.
     """
     if len(wanted) and not (found >= 0).any():
         example = nearest(wanted[0], known) or f" (such as {known[0]})" if len(known) else ""

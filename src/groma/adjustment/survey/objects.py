@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Tables of what was measured of any object: distances, known planes and directions, poses, and what is held.
+"""Tables of measurements of any objects: distances, known planes and directions, poses, and held objects.
 
 Points of the scene of which something was measured become control points without known coordinates: a distance ties
 two objects that are estimated together, and points are too many for that. Their observations become marks.
@@ -47,7 +47,7 @@ _KINDS = {"point": Kind.POINT, "line": Kind.LINE, "plane": Kind.PLANE, "directio
 
 @dataclass(frozen=True)
 class ObjectGates:
-    """What is said of measured objects."""
+    """Messages about measured objects."""
 
     parallel_deg: float = gate(
         10.0, "degrees", "from parallel, from which two lines have a shortest distance and no width", "cost: a meaning"
@@ -249,7 +249,7 @@ def pose_table(scene: Scene, given: PosesFile, stated: tuple[float, ...], notes:
 
 
 def held_table(scene: Scene, names: Sequence[str]) -> Held:
-    """Return the table of what is held: by name, or by patterns of images and control points."""
+    """Return the table of held objects, given by name or by patterns of images and control points."""
     kind, idx = [], []
     for name in names:
         known = ((scene.images.names, Kind.IMAGE), (scene.control_points.names, Kind.CONTROL_POINT))

@@ -19,7 +19,7 @@ from groma.scene import Scene
 _HALF_TURN = np.array([[1.0, 0.0, 0.0, 0.0]])
 #: From the axes x forward, y left, z up to ours, as a quaternion.
 _VEHICLE = np.array([[-0.5, 0.5, -0.5, 0.5]])
-#: Images that are tried for the turn of the whole, where places do not tell it (cost: time).
+#: Images that are tried for the global rotation, if positions do not determine it (cost: time).
 _TRIED = 50
 
 
@@ -31,7 +31,7 @@ def check_orientations(scene: Scene, rotation: FloatArray | None) -> None:
     scene : Scene
         With measured poses.
     rotation : (3, 3) float or None
-        From the scene to the frame of the poses, as their places say; None: whatever fits most of them.
+        From the scene to the frame of the poses, by their positions; None: the one that most of them support.
 
     Raises
     ------

@@ -57,7 +57,7 @@ _TERMS = (
 def settled(scene: Scene) -> Scene:
     """Return a scene that measurements of other instruments place where these fit best; what was measured stays.
 
-    The scale stays, too, where depths or stereo pairs tell it; scenes of which something is held stay as they are.
+    The scale is kept, too, if depths or stereo pairs determine it; scenes with held objects are left unchanged.
     """
     if not scene.is_tied or len(scene.held) or not scene.num_images:
         return scene

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What an adjustment says of the measurements of other instruments: one record for each, and sums of kinds.
+"""Records of the measurements of other instruments after an adjustment: one for each, and sums by kind.
 
 :mod:`groma.adjustment.survey.reliability` computes them and has the formulas.
 """
@@ -139,7 +139,7 @@ class Reliability:
 
 
 def rejection_limit(measurements: Sequence[Measurement]) -> float:
-    """Return the normalised residual that none of so many good measurements exceeds, but for a small probability."""
+    """Return the normalised residual that any of ``count`` good measurements exceeds with a small probability."""
     tests = sum(one.normalized is not None for one in measurements)
     return float(-scipy.special.ndtri(GATES.false_alarm / (2.0 * max(tests, 1))))
 

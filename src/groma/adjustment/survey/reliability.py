@@ -63,7 +63,7 @@ from groma.scene.local_frame import local_frame
 from groma.scene.survey import accepted, only_rejected
 from groma.solver.covariance.marginals import Covariances
 
-#: Names of coordinates by kind of measurement. Angles are told in degrees: which coordinates are angles.
+#: Names of coordinates by kind of measurement; those that are angles, reported in degrees.
 _COORDINATES = {
     "camera position": "xyz", "camera pose": ("x", "y", "z", "turn x", "turn y", "turn z"), "control point": "xyz",
     "mark": "uv", "distance": ("",), "known plane": ("",), "known direction": ("a", "b"),
@@ -74,7 +74,7 @@ _TERMS = (
     camera_poses.POSITIONS, camera_poses.POSES, control_points.MARKS, control_points.CONTROL, distances.TERM,
     known_geometry.PLANES, known_geometry.DIRECTIONS,
 )  # fmt: skip
-#: A redundancy number below this says that nothing checks a measurement.
+#: A measurement with a redundancy number below this is uncontrolled.
 _UNCHECKED = 1e-6
 
 
@@ -193,7 +193,7 @@ def _entries(
             kind = "mark"
         elif factor.type_name == "vector_prior" and groups == {"control_points"}:
             kind = "control point"
-        elif factor.type_name == "pose_prior":  # poses that the scene knows of its frames come first
+        elif factor.type_name == "pose_prior":  # the pose priors of the scene come first
             kind = "camera pose" if not isinstance(factor.loss, Trivial) else ""
         if kind:
             yield kind, next(rows[kind]), factor

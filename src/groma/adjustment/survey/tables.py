@@ -111,7 +111,7 @@ def sigma_of(given: Places, stated: tuple[float, ...], option: str, needed: Any 
 
 
 def tell_unknown(given: Places, rows: IntArray, known: Sequence[str], words: str, notes: list[str]) -> None:
-    """Say which names of a file the scene does not know, and which image without a measurement each may mean."""
+    """Add a note on unknown names of a file, with the most similar image without a measurement."""
     unknown = [given.names[row] for row in np.flatnonzero(rows < 0)]
     if unknown:
         named = set(rows.tolist())

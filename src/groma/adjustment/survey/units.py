@@ -2,7 +2,7 @@
 """Whether measurements are in one unit of length: feet among metres, millimetres among metres, heights in feet.
 
 Photographs have no scale, so one unit alone cannot be wrong. Two kinds of measurement can contradict each other, by a
-factor that people know: then it is not noise.
+ratio of common units: then it is not noise.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _UNITS = {"feet": 0.3048, "millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.
 
 
 def unit_words(ratio: float) -> tuple[str, str] | None:
-    """Return the units of lengths and of others, if they are so many times as long; None if no two units are."""
+    """Return two units of length with this ratio; None if there are none."""
     for name, metres in _UNITS.items():
         if abs(ratio * metres - 1.0) < GATES.near:
             return name, "metres"
@@ -41,7 +41,7 @@ def unit_words(ratio: float) -> tuple[str, str] | None:
 
 
 def check_lengths(ratio: float, lengths: str, others: str) -> None:
-    """Refuse lengths that are so many times as long as others say, where that is the factor of two units.
+    """Refuse lengths whose ratio to other measurements is that of two units.
 
     Raises
     ------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How cameras with a rolling shutter moved while their images were read: what is known of it beforehand.
+"""The prior of the motions of cameras with a rolling shutter during readout.
 
 That images were read row by row is known to the terms of points, lines and marks, which ask
 :mod:`groma.adjustment.terms.readout` for the motion that each of their observations depends on.

@@ -47,7 +47,7 @@ class Term:
     tables: tuple[str, ...]
     #: Groups of landmarks that must take part: ``points``, ``lines``, ``planes``, ``directions``.
     landmarks: tuple[str, ...]
-    #: Makes the factors; it may add groups of variables of its own to ``draft.variables``.
+    #: Makes the factors; it may add further groups of variables to ``draft.variables``.
     factors: Callable[[Draft], Iterator[Group]]
 
     def applies(self, draft: Draft) -> bool:

@@ -44,7 +44,7 @@ from groma.geometry import quaternion
 from groma.geometry.algebra import unit
 
 #: Segments for which the sine of the angle between their line and the ray to its anchor is smaller are left out of
-#: ``normal``: both parts of the residual then say the same.
+#: ``normal``: both parts of the residual are then the same.
 MIN_SINE = 1e-3
 #: Types of the factors of segments.
 LINE_FACTORS = ("line_reprojection", "line_bearing", "line_unprojection", "line_normal")

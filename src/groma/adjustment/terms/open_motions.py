@@ -68,7 +68,7 @@ def _open(told: FloatArray) -> FloatArray:
 
 
 def _told(scene: Scene, middle: FloatArray, length: float) -> FloatArray:
-    """Return rows (n, 7) of what measurements say of the motions, in units of the length."""
+    """Return rows (n, 7): derivatives of the measurements by the motions, in units of the length."""
     centers, marked = scene.cam_centers_in_world, scene.control_points.xyz
     rows = [np.zeros((1, 7))]
     held = {kind: scene.held.idx[scene.held.kind == kind] for kind in Kind}

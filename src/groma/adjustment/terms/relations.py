@@ -92,7 +92,7 @@ def lengths_per_pixel(scene: Scene, kind: str) -> FloatArray:
 
 
 def _weights(draft: Draft, kind: str, rows: IntArray) -> FloatArray:
-    """Inverse standard deviations: those of the relations, else what options say of angles and images of lengths."""
+    """Inverse standard deviations: those of the relations, else of angles by options and of lengths by images."""
     relations, segments = draft.scene.relations, draft.scene.lines.segments
     sigma, landmark = relations.sigma(kind)[rows], getattr(relations, kind)[rows, 0]
     if kind in ANGLES:

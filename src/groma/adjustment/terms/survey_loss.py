@@ -26,7 +26,7 @@ GATES = SurveyGates()
 
 
 def survey_loss(coordinates: int) -> Huber:
-    """Return the loss of measurements of so many coordinates.
+    """Return the loss of measurements with a number of coordinates.
 
     Least squares up to where one in a thousand ends, linear beyond: good measurements count in full, and a wrong one
     pulls no more than a bad one. It is convex, so that a standard deviation stated too small costs weight, not the map.
