@@ -2,7 +2,7 @@
 """Reading files that nobody vouches for: sizes are known before bytes are expanded, names stay in their folder.
 
 In come files as they lie on disk; out come bytes, lines of text, arrays and images, each within a bound that follows
-from the size of the file, or a :class:`~groma.errors.FileFormatError` that says the bound. All readers stand on these
+from the size of the file, or a :class:`~groma.errors.FileFormatError` with the bound. All readers stand on these
 five: :mod:`~groma.bounded.content` (whole files, gzip, bzip2), :mod:`~groma.bounded.text` (lines, words, finite
 numbers), :mod:`~groma.bounded.documents` (JSON), :mod:`~groma.bounded.arrays` (``.npz``, ``.npy``) and
 :mod:`~groma.bounded.images` (headers before pixels).

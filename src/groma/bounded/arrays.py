@@ -3,7 +3,7 @@
 
 ``numpy.load`` takes memory as the headers ask for it, expands whatever is in the archive, and lets through errors of
 Python's tokenizer. Here nothing is expanded before it is known how large it becomes: all members together, counted as
-double precision at least, because that is what is made of them.
+double precision at least, to which they are converted.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _KINDS = "biufcSU"
 
 @dataclass(frozen=True)
 class Header:
-    """What an array says of itself."""
+    """The header of an array."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
@@ -57,7 +57,7 @@ class Header:
         return math.prod(self.shape) * max(self.dtype.itemsize, 8)
 
 
-#: Raises FileFormatError if an array is not what is wanted, before it is read.
+#: Raises FileFormatError if an array is not of the expected form, before it is read.
 Check = Callable[[Header], None]
 
 
@@ -131,7 +131,7 @@ def form(kinds: str, *shape: int | None) -> Check:
 
 @contextmanager
 def opened_arrays(path: str | os.PathLike[str]) -> Iterator[ArrayMembers]:
-    """Open an ``.npz`` file; what is wrong with the zip file itself is a :class:`zipfile.BadZipFile`."""
+    """Open an ``.npz`` file; :class:`zipfile.BadZipFile` if the zip file itself is damaged."""
     try:
         opened = zipfile.ZipFile(path)
     except (NotImplementedError, struct.error) as error:  # a version of the format that Python does not read

@@ -41,7 +41,7 @@ def expanded_limit(size: int) -> int:
 
 
 def read_content(path: str | os.PathLike[str]) -> bytes:
-    """Return the bytes of a file; gzip and bzip2 (told by content, not by name) are expanded.
+    """Return the bytes of a file; gzip and bzip2, recognised by content, are decompressed.
 
     Raises
     ------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""JSON documents: nothing that is not finite, nothing too deep, and what is taken out of them is of the kind expected.
+"""JSON documents: finite numbers, bounded depth, and values of the expected type.
 
 Every function takes the place where a value stands, for the message, such as ``path, camera 3``.
 """
@@ -53,12 +53,12 @@ def read_document(path: str | os.PathLike[str]) -> Any:
 
 
 def begins_with(head: bytes, mark: bytes) -> bool:
-    """Whether the first bytes of a file are those of a document that begins with ``{`` or ``[``, as asked for."""
+    """Whether the first bytes of a file are those of a document that starts with the given ``{`` or ``[``."""
     return head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(mark)
 
 
 def of_kind(value: Any, kind: type[_Kind], place: object) -> _Kind:
-    """Return a value if it is a dictionary, a list or a text, as asked for; else raise FileFormatError.
+    """Return a value if it is of the given type (dictionary, list or text); else raise FileFormatError.
 
     A text is one that can be written again, of bounded length.
     """
@@ -112,7 +112,7 @@ def table(rows: Sequence[Any], shape: tuple[int, ...], place: object) -> FloatAr
 
 
 def _odd_row(rows: Sequence[Any], shape: tuple[int, ...]) -> Any:
-    """Return the first row that is not what it should be."""
+    """Return the first row of another form."""
     for row in rows:
         try:
             found = np.array(row)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Images: the size in the header is looked at before a decoder takes memory for it.
+"""Images: the size in the header is checked before a decoder allocates memory.
 
 PNG, JPEG, BMP, WebP, PNM and TIFF are known, which are the endings that groma takes for images; a decoder never sees
-any other kind, whatever the name of the file says.
+any other kind, regardless of the name of the file.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def decoded(content: bytes, flags: int) -> npt.NDArray[Any] | None:
 
 
 def image_size(content: bytes) -> tuple[int, int] | None:
-    """Return width and height that the header of an image says; None if it is none of the kinds that are known."""
+    """Return width and height in the header of an image; None for unknown formats."""
     for magic, read in _KINDS.items():
         if content.startswith(magic):
             try:

@@ -10,7 +10,7 @@ def json_text(content: dict[str, object]) -> str:
 
 
 def plain(value: object) -> object:
-    """Turn NumPy numbers and arrays, enumerations and paths into what JSON knows; not-finite numbers into None."""
+    """Convert NumPy numbers and arrays, enumerations and paths to JSON types; non-finite numbers to None."""
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

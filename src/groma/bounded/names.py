@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Names of files that stand in files: they mean something inside a folder, never outside of it.
 
-Only names are looked at. A symbolic link inside the folder is followed: it was put there by whoever made the folder.
+Only names are checked. A symbolic link inside the folder is followed: the owner of the folder made it.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Lines, words and numbers of text files: each of bounded length, one after the other, every number finite."""
+"""Lines, words and numbers of text files, read one by one, of bounded length; every number finite."""
 
 from __future__ import annotations
 
@@ -88,5 +88,5 @@ def whole(word: str, place: object, expected: str = "a whole number") -> int:
 
 
 def shown(word: str | bytes | Sequence[str]) -> str:
-    """Return what a file holds as it goes into a message: quoted, and cut where it is long."""
+    """Return content of a file for a message: quoted, and cut if long."""
     return repr(word[:40]) + ("..." if len(word) > 40 else "")

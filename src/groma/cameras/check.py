@@ -75,7 +75,7 @@ def check_camera(
 
 
 def derivative_errors(model: CameraModel, rng: np.random.Generator, count: int = 50) -> dict[str, float]:
-    """Return the largest errors of the derivatives by ``point`` and ``parameters``, over what is allowed.
+    """Return the largest errors of the derivatives by ``point`` and ``parameters``, divided by the tolerance.
 
     At random points in front of a camera with a little distortion: 0.01 for each of its coefficients.
     """

@@ -111,7 +111,7 @@ def _wrap(model_tag, params, difference):
 
 @kernel
 def _leave(params, difference):
-    """Wrap nothing: every border of the image is a place of its own."""
+    """Wrap nothing: opposite borders of the image are different places."""
 
 
 # ---------------------------------------------------------------------------------------------------------- Public

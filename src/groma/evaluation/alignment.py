@@ -62,7 +62,7 @@ def align_points(source: npt.ArrayLike, target: npt.ArrayLike, with_scale: bool 
 
 @dataclass(frozen=True, eq=False)
 class PoseAlignment:
-    """A similarity of two worlds, and what it was found from."""
+    """A similarity of two worlds, and the data of its estimate."""
 
     #: ``target_from_source``.
     similarity: Similarity

@@ -105,7 +105,7 @@ def sentences(numbers: dict[str, Any]) -> list[str]:
 
 
 def score_cabinet(scene: Scene, measured_from_scene: Similarity) -> CabinetScores:
-    """Find the lines on the edges of the cabinet and what they say about its size."""
+    """Find the lines on the edges of the cabinet, and its size by them."""
     turn = np.array([[np.cos(HEADING), -np.sin(HEADING), 0], [np.sin(HEADING), np.cos(HEADING), 0], [0, 0, 1]])
     ends = (measured_from_scene.points(scene.lines.segments.reshape(-1, 3)) - CENTER) @ turn
     ends = ends.reshape(-1, 2, 3)

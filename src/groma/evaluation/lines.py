@@ -135,7 +135,7 @@ def evaluate_lines(
     Parameters
     ----------
     estimate, reference : Scene or Geometry
-        What is judged, and what is taken for true; :func:`groma.io.reference.read_reference` reads geometry from files.
+        The estimate and the reference; :func:`groma.io.reference.read_reference` reads geometry from files.
     thresholds : sequence of float, optional
         See :func:`score_lines`.
     align : bool
@@ -200,7 +200,7 @@ def _near(segments: FloatArray, step: float, taus: list[float], target: Distance
 
 
 def places_on(segments: FloatArray, count: IntArray) -> tuple[FloatArray, IntArray]:
-    """Return the middles of so many equal parts of each segment, (n, 3), and the segment of each."""
+    """Return the midpoints (n, 3) of equal parts of each segment, and the segment of each."""
     owner = np.repeat(np.arange(len(segments)), count)
     inside = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
     share = ((inside + 0.5) / count[owner])[:, None]

@@ -64,7 +64,7 @@ def as_numbers(scores: Any, *left_out: str) -> dict[str, object]:
 def evaluate_poses(estimate: Scene, reference: Scene) -> PoseScores:
     """Compare the camera poses of two scenes, aligned by a similarity.
 
-    Images are matched by name, without folder or ending where that tells one from all others.
+    Images are matched by name, without folder or suffix where that is unique.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ from groma.geometry import quaternion
 from groma.scene import Scene
 from groma.scene.line_intervals import line_pieces
 
-#: Places along a line that are looked up in a view (cost: time).
+#: Places along a line that are tested in a view (cost: time).
 _PLACES = 100
 #: Distances at which lines are counted, pixels (convention: rows of the report).
 LIMITS = (1.0, 3.0, 10.0)

@@ -42,7 +42,7 @@ SEGMENT_LENGTHS, SEGMENT_STEP = SCORES.segment_lengths, SCORES.segment_step
 
 @dataclass(frozen=True)
 class Spread:
-    """What is said of a set of errors."""
+    """Statistics of a set of errors."""
 
     rmse: float
     mean: float

@@ -31,7 +31,7 @@ def refuse_unusable_numbers(factor: Factor, variables: Mapping[str, Variables]) 
 
 
 def _refuse_infinite(factor: Factor, field: str, values: FloatArray) -> None:
-    if np.isfinite(values.sum()):  # a sum is not finite if a part is not; large parts may overflow, so look again
+    if np.isfinite(values.sum()):  # a sum is not finite if a part is not; large parts may overflow, so check again
         return
     bad: BoolArray = ~np.isfinite(values)
     if not bad.any():

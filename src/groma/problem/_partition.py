@@ -36,7 +36,7 @@ def _couplings(problem: Problem, groups: set[str]) -> list[tuple[str, str, str]]
 
 
 def choose_landmarks(problem: Problem, eliminate: str | tuple[str, ...], warnings: list[str]) -> tuple[str, ...]:
-    """Return the groups that are eliminated; what is noteworthy about the choice is added to ``warnings``.
+    """Return the groups that are eliminated; notes about the choice are added to ``warnings``.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def choose_landmarks(problem: Problem, eliminate: str | tuple[str, ...], warning
     free = free_groups(problem)
     if eliminate == "auto":
         if not _couplings(problem, set(free)):
-            return tuple(free)  # nothing is coupled: every variable is a small problem of its own
+            return tuple(free)  # nothing is coupled: every variable is an independent problem
         chosen = [name for name in free if problem.variables[name].manifold.kind in LANDMARK_KINDS]
         while coupled := _couplings(problem, set(chosen)):
             name, first, second = coupled[0]

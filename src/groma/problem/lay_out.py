@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""From a problem to its layout: what is eliminated, what is kept, and in which order everything lies.
+"""From a problem to its layout: eliminated variables, kept variables, and the order of everything.
 
 The steps of :func:`lay_out`, in order: choose the landmarks, form classes of kept blocks, draft the records of every
 factor group, sort landmarks and factors, number the blocks of the reduced system, and cut the work into chunks.
@@ -35,7 +35,7 @@ CHUNK_ALONE = 512
 
 
 def lay_out(problem: Problem, eliminate: str | tuple[str, ...] = "auto", chunk_size: int = CHUNK_SIZE) -> Layout:
-    """Choose what is eliminated, sort the factors and find the blocks of the reduced system."""
+    """Choose the eliminated groups, sort the factors and find the blocks of the reduced system."""
     warnings: list[str] = []
     landmarks = choose_landmarks(problem, eliminate, warnings)
     kept, member_of = kept_classes(problem, landmarks)
@@ -173,7 +173,7 @@ def _incidences(problem, group, e, order, layouts: list[FactorLayout], kept, tab
 
 
 def _starts(landmark: IntArray, count: int) -> IntArray:
-    """Return where the factors of each landmark begin, (count + 1,), for landmarks in ascending order."""
+    """Return the bounds (count + 1,) of the factors of each landmark, for landmarks in ascending order."""
     starts = np.zeros(count + 1, np.int64)
     np.cumsum(np.bincount(landmark, minlength=count), out=starts[1:])
     return starts

@@ -133,7 +133,7 @@ class NormalEquations:
         """Return the total cost; also store ``costs`` and ``hidden``, the degenerate factors, both by factor group.
 
         With ``landmark_costs`` (one array of zeros per eliminated group) the cost of each landmark is added there.
-        Chunks that are not ``wanted`` are left out.
+        Chunks not in ``wanted`` are left out.
         """
 
         def work(share: int) -> tuple[list[float], list[int]]:
@@ -156,7 +156,7 @@ class NormalEquations:
         return float(sum(self.costs))
 
     def _is_little(self, wanted: Callable[[Chunk], bool] | None) -> bool:
-        """Whether chunks that are wanted hold too few factors to wake another thread for them."""
+        """Whether the selected chunks hold too few factors for another thread."""
         return wanted is not None and sum(c.size for c in self.layout.chunks if wanted(c)) < FACTORS_ALONE
 
     def _runs_of_all(self, share: int) -> list[tuple[int, int, int]]:
@@ -279,7 +279,7 @@ class NormalEquations:
             W[(begin - first) * size : (end - first) * size] = 0.0
 
     def blocks_of_chunk(self, share: int, chunk: Chunk, kept_class: int) -> tuple[FloatArray, int]:
-        """Return an array with the blocks W of a chunk, in double precision, and the incidence it begins with."""
+        """Return an array with the blocks W of a chunk, in double precision, and its first incidence."""
         e = chunk.eliminated
         assert e is not None
         first = self.layout.eliminated[e].incidences[kept_class].pointer[chunk.begin] if self.compact else 0

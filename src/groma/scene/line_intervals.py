@@ -26,7 +26,7 @@ from groma.scene.table import Table, column
 if TYPE_CHECKING:
     from groma.scene.scene import Scene
 
-#: A ray whose angle with a line has a smaller sine (squared) does not say where on the line it passes.
+#: A ray whose angle with a line has a smaller sine (squared) does not determine its nearest place on the line.
 MIN_SQUARED_SINE = MIN_SINE**2
 
 
@@ -36,7 +36,7 @@ class LineIntervals(Table, noun="interval", optional=True):
 
     #: (K,) the line.
     line_idx: IntArray = column(np.int64, refers="lines")
-    #: (K,) where on its segment the interval begins and ends: 0 is the first end point, 1 the second.
+    #: (K,) bounds of the interval on its segment: 0 is the first end point, 1 the second.
     begin: FloatArray = column(np.float64)
     end: FloatArray = column(np.float64)
 
@@ -58,7 +58,7 @@ class LineIntervals(Table, noun="interval", optional=True):
         return line[order], share[order]
 
     def covers(self, line_idx: IntArray, share: FloatArray, margin: float = 0.0) -> BoolArray:
-        """Tell which places (N,) on lines, as shares, lie in an interval, or so many of its lengths beyond."""
+        """Return which places (N,) on lines, as shares, lie in an interval extended by a multiple of its length."""
         count = int(line_idx.max(initial=-1)) + 1
         kept = self.take(self.line_idx < count)
         line, interval = kept.of_lines(count)
@@ -126,7 +126,7 @@ def observed_shares(scene: Scene) -> FloatArray:
 
 
 def one_line_per_interval(scene: Scene) -> Scene:
-    """Return the scene with every interval as a line of its own, for what knows only segments with their tracks.
+    """Return the scene with every interval as a separate line, for formats of segments with tracks.
 
     The first interval keeps the identifier; further ones get new identifiers. An observed segment goes to the interval
     that it covers most of, points on the line to the nearest one, and every interval lies on all planes and along all

@@ -17,7 +17,7 @@ from groma._typing import FloatArray
 from groma.scene.scene import Scene
 from groma.scene.similarity import Similarity
 
-#: A scene is far from the origin if that is so many times as far as half of its cameras and points from their middle;
+#: A scene is far from the origin if that is this many times as far as half of its cameras and points from their middle;
 #: and of unusual size if these are so many units, or so many of them a unit, from there (convention: three
 #: of sixteen digits are given away).
 FAR = 1000.0

@@ -47,7 +47,7 @@ class RightColumns(Table, noun="column", optional=True):
 
 @dataclass(frozen=True, eq=False)
 class LineDepths(Table, noun="segment", optional=True):
-    """Inverse depths of the two ends of observed segments: what depth cameras and stereo pairs know with even noise.
+    """Inverse depths of the two ends of observed segments, of uniform noise for depth cameras and stereo pairs.
 
     They are compared as what they are for a second camera, displaced across the segment: an end at the inverse depth w
     appears there shifted by f b w pixels.

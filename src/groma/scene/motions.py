@@ -28,7 +28,7 @@ class CameraMotions(Table, noun="motion", optional=True):
     #: (N, 6) how far the camera moves while the whole image is read (scene units) and turns (rotation vector, radians),
     #: both in the axes that it has in the middle: estimated.
     motion: FloatArray = column(np.float64, 6, length=(1, 1, 1, 0, 0, 0))
-    #: (N, 6) what is known of it beforehand, and its standard deviations.
+    #: (N, 6) the prior motion, and its standard deviations.
     expected: FloatArray = column(np.float64, 6, length=(1, 1, 1, 0, 0, 0))
     sigma: FloatArray = column(np.float64, 6, length=(1, 1, 1, 0, 0, 0), check=check_sigma)
     #: (N,) :data:`ROWS` or :data:`COLUMNS`.

@@ -83,7 +83,7 @@ class LineObservations(Table, noun="observation"):
 
 @dataclass(frozen=True, eq=False)
 class Relations:
-    """Structural relations between landmarks: (R, 2) index pairs, first and second landmark as the names say.
+    """Structural relations between landmarks: (R, 2) index pairs, first and second landmark by the names.
 
     Each kind may have standard deviations, one for each pair: how far the first is off the second, in scene units;
     angles in radians. Where one is 0 it follows from the noise of the images (see
@@ -130,7 +130,7 @@ class Relations:
             value = convert(f"Relations.{item.name}", getattr(self, item.name), item)
             if item.name.endswith(_SIGMA):
                 count = len(getattr(self, item.name.removesuffix(_SIGMA)))
-                value = value if value.any() else np.zeros(count)  # none of its own is as if left out
+                value = value if value.any() else np.zeros(count)  # all zero: as if left out
                 if len(value) != count:
                     raise ShapeError(f"Relations.{item.name} must have one row for each of {count}; got {len(value)}.")
                 if count and value.min() < 0.0:
@@ -146,7 +146,7 @@ class Relations:
         return tuple(item.name for item in fields(cls) if not item.name.endswith(_SIGMA))
 
     def sigma(self, kind: str) -> FloatArray:
-        """Return the standard deviations (R,) of one kind; 0 where the noise of the images tells them."""
+        """Return the standard deviations (R,) of one kind; 0: by the noise of the images."""
         return getattr(self, f"{kind}_sigma")
 
     def take(self, **rows: npt.ArrayLike) -> Self:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The part of each plane that is worth showing: the convex hull of what lies on it, and a colour to tell it by."""
+"""The displayed part of each plane: the convex hull of the landmarks on it, and a colour."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from groma.scene.scene import Scene
 #: Members farther from their middle than this multiple of what holds four fifths of them are left out (convention: of
 #: what is drawn).
 _FAR = 3.0
-#: Colours that are told apart by most eyes, the first ones best.
+#: Colours that most eyes distinguish, the first ones best.
 PALETTE = np.array(
     [list(bytes.fromhex(colour)) for colour in "d64b36 2c7ac4 3a9e5c e2a028 8a63c9 26aab2 cd5c9a 826842".split()],
     np.uint8,
@@ -24,7 +24,7 @@ def plane_patches(scene: Scene) -> tuple[list[FloatArray], IntArray]:
     Parameters
     ----------
     scene : Scene
-        Planes, and the relations that say what lies on them.
+        Planes, and the relations of landmarks to them.
 
     Returns
     -------
@@ -70,7 +70,7 @@ def patch_groups(members: IntArray) -> IntArray:
 
 
 def triangle_fans(polygons: list[FloatArray]) -> tuple[FloatArray, IntArray]:
-    """Return the corners of convex polygons, one after the other (n, 3), and their triangles (t, 3)."""
+    """Return the concatenated corners (n, 3) of convex polygons, and their triangles (t, 3)."""
     begin = np.cumsum([0, *(len(corners) for corners in polygons)])
     triangles = [
         first + np.column_stack([np.zeros(len(corners) - 2, int), *(np.arange(len(corners) - 2) + k for k in (1, 2))])

@@ -199,7 +199,7 @@ class Scene:
 
     @property
     def is_metric(self) -> bool:
-        """Whether anything measured in the cameras tells the scale: depths, stereo pairs, planes."""
+        """Whether measurements of the cameras determine the scale: depths, stereo pairs, planes."""
         return any(map(len, (self.point_depths, self.right_columns, self.line_depths, self.plane_observations)))
 
     @property
@@ -210,17 +210,17 @@ class Scene:
 
     @property
     def is_surveyed(self) -> bool:
-        """Whether places of cameras or control points were measured that tell where the scene is, and its scale."""
+        """Whether measured cameras or control points determine the position and scale of the scene."""
         return len(self.camera_positions) + len(self.camera_poses) + int(self.control_points.is_control.sum()) > 1
 
     @property
     def is_tied(self) -> bool:
-        """Whether anything measured outside the images, or held, says where the scene is or how it is turned."""
+        """Whether measurements of other instruments, or held objects, refer to the frame of the scene."""
         return self.is_surveyed or any(map(len, (self.known_planes, self.known_directions, self.held)))
 
     @property
     def has_scale(self) -> bool:
-        """Whether anything measured tells the scale."""
+        """Whether any measurement determines the scale."""
         return self.is_metric or self.is_surveyed or len(self.distances) > 0
 
     @property
@@ -316,7 +316,7 @@ class Scene:
         """Return the scene seen from another world frame; what the cameras see stays the same.
 
         Lengths in camera and rig frames are scaled too. An array (8,) of :mod:`groma.geometry.sim3` will do as well.
-        Without ``measured`` what other instruments say of places in the world stays, and the scene moves.
+        Without ``measured``, measurements of other instruments in the world are not transformed.
         """
         if not isinstance(new_from_old, Similarity):
             new_from_old = Similarity.from_array(new_from_old)

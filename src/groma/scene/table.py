@@ -54,7 +54,7 @@ def column(
     refers : str or (str, str)
         The table of the scene that the indices refer to; of pairs of indices the two tables.
     kinds : str
-        The indices refer to tables of :data:`OBJECTS`; the column of this name says to which.
+        The indices refer to tables of :data:`OBJECTS`, selected by the column of this name.
     world : str
         What the rows are in the world, for the column to move with it: ``points``, ``directions``, ``lines``,
         ``planes``, ``poses`` or ``covariances`` (of points), methods of :class:`~groma.scene.similarity.Similarity`.
@@ -64,7 +64,7 @@ def column(
     optional : bool
         Whether files may lack the column; it then has no rows.
     measured : bool
-        An instrument other than the cameras says so, in the world: it stays where the scene is moved to fit it.
+        Measured in the world by another instrument: not transformed when the scene is moved to fit.
     check : callable, optional
         Takes the name of the column and its numbers, and raises where they are not what they must be.
     """
@@ -110,7 +110,7 @@ class Table:
         self._check()
 
     def _check(self) -> None:
-        """Check what only this table knows."""
+        """Checks of this table alone."""
 
     def __init_subclass__(cls, noun: str = "", optional: bool = False, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
@@ -204,7 +204,7 @@ def convert(name: str, value: Any, item: Field[Any]) -> Any:
         raise ShapeError(f"{name} must have shape ({wanted}{',' if not row else ''}); got {source.shape}.")
     array = np.ascontiguousarray(source, dtype)
     if dtype.kind == "f":
-        # The sum is finite for nearly every good array and costs no temporary; only then look closer.
+        # The sum of a good array is nearly always finite and needs no temporary; else check each number.
         with np.errstate(over="ignore", invalid="ignore"):
             suspicious = not np.isfinite(array.sum())
         if suspicious and not np.isfinite(array).all():
@@ -280,7 +280,7 @@ def object_references(scene: type) -> tuple[tuple[str, str, str], ...]:
 
 
 def moved_table(table: Any, new_from_old: Similarity, measured: bool = True) -> Any:
-    """Return a table seen from another world; without ``measured`` what instruments say of the world stays."""
+    """Return a transformed table; without ``measured``, measurements of other instruments are kept."""
     columns = {}
     for item in fields(table):
         about, values = item.metadata, getattr(table, item.name)
@@ -290,7 +290,7 @@ def moved_table(table: Any, new_from_old: Similarity, measured: bool = True) -> 
 
 
 def _moved_column(values: FloatArray, about: Mapping[str, Any], new_from_old: Similarity) -> FloatArray:
-    """Return a column seen from another world, or in another unit of length, as its declaration says."""
+    """Return a column transformed, or in another unit of length, by its declaration."""
     if about["world"]:
         return getattr(new_from_old, about["world"])(values)
     return values * new_from_old.scale ** np.asarray(about["length"], float)
@@ -332,7 +332,7 @@ def check_index(name: str, index: IntArray, size: int, target: str) -> None:
 
 
 def check_quaternions(name: str, poses: FloatArray) -> None:
-    """Raise when poses (N, 7) do not begin with unit quaternions."""
+    """Raise unless poses (N, 7) start with unit quaternions."""
     if len(poses) == 0:
         return
     with np.errstate(over="ignore"):

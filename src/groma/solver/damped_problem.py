@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What the solver's loop asks of a problem: linearise, try a step, make it better, accept it or refuse it.
+"""The interface between the solver's loop and a problem: linearise, try a step, improve, accept or reject it.
 
 :func:`groma.solver.solve.minimise` drives whatever has these methods: the joint solve (``joint.py``), variables that do
 not depend on each other (``independent.py``), landmarks that come in shards (``reduce/shards.py``).
@@ -17,7 +17,7 @@ from groma.solver.termination import Termination
 
 @dataclass(frozen=True)
 class Trial:
-    """States, as far as the loop needs to know them, and the step that led there."""
+    """States after a step, as far as the loop needs them, and the step."""
 
     cost: float
     #: Factors that cannot be evaluated at these states and count nothing.
@@ -74,7 +74,7 @@ class DampedProblem(Protocol[T]):
         """Iterations of the linear solver in the last step; 0 for direct solvers."""
 
     def start(self) -> T:
-        """Evaluate the problem where it begins."""
+        """Evaluate the problem at its initial states."""
 
     def linearize(self) -> None:
         """Form the normal equations of the present states and damping, unless they are formed."""

@@ -76,7 +76,7 @@ class BlockProgress:
 
 
 class IndependentBlocks:
-    """Levenberg-Marquardt on every variable of a layout without kept blocks; Gauss-Newton if it begins undamped."""
+    """Levenberg-Marquardt on every variable of a layout without kept blocks; Gauss-Newton without initial damping."""
 
     def __init__(self, layout: Layout, workers: Workers, initial_damping: float, tolerance: float = 1e-6) -> None:
         self.layout = layout
@@ -110,7 +110,7 @@ class IndependentBlocks:
         self._growth = [np.full(e.count, 2.0) for e in self.layout.eliminated]
 
     def _with_any(self, variables: list[BoolArray]) -> Callable[[Chunk], bool] | None:
-        """Return what tells whether a chunk has any of these variables of each group; None where they are all."""
+        """Return a function that tells whether a chunk has any of these variables; None if they are all."""
         if all(mine.all() for mine in variables):
             return None
         found = [np.logical_or.reduceat(mine, begin) for mine, begin in zip(variables, self._begins, strict=True)]
@@ -126,7 +126,7 @@ class IndependentBlocks:
         return costs
 
     def _evaluated(self, states: States, wanted: Callable[[Chunk], bool] | None) -> list[FloatArray]:
-        """Return the cost of each variable of each group in chunks that are wanted, 0 in others."""
+        """Return the cost of each variable of each group in the selected chunks, 0 in others."""
         costs = [np.zeros(e.count) for e in self.layout.eliminated]
         self.equations.cost(self._prepared(states), costs, wanted)
         self._costs_are_of = states if wanted is None else None

@@ -79,7 +79,7 @@ class NoDamping:
 
 
 def damping_from(first: float, variables: Mapping[str, Variables]) -> Damping:
-    """Return the damping of a problem that begins with a value; none at all where that is zero.
+    """Return the damping with an initial value; none if that is zero.
 
     Poses of a long chain have directions that its motions determine ten orders of magnitude less than single poses:
     steps along these end only where the damping is lower still. It may be, where some pose is held.

@@ -65,7 +65,7 @@ class LandmarkRefiner:
 
 
 def landmark_refiner(layout: Layout, workers: Workers, options: SolverOptions) -> LandmarkRefiner | None:
-    """Return what refines the landmarks of a layout; None where no steps of their own are asked for."""
+    """Return the refinement of the landmarks of a layout; None if no separate steps are requested."""
     groups = [
         e.group for e in layout.eliminated if options.landmark_groups is None or e.group in options.landmark_groups
     ]

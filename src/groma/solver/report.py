@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a solve returns besides the states: why it stopped, what it cost, how long it took, what was odd."""
+"""The report of a solve: termination, costs, timings, notes."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class SolveReport:
     num_degenerate: dict[str, int] = field(default_factory=dict)
     #: Landmarks with a direction that the data did not determine at the last linearisation.
     num_underdetermined_landmarks: int = 0
-    #: ``dense``, ``sparse``, ``pcg``, or ``blocks`` when every variable is a problem of its own.
+    #: ``dense``, ``sparse``, ``pcg``, or ``blocks`` if every variable is an independent problem.
     linear_solver: str = ""
     threads: int = 1
     #: Wall time by stage, and ``total``.
@@ -143,7 +143,7 @@ def note_costs(
 
 
 def _num_held(layout: Layout) -> int:
-    """Return how many landmarks are held, all or in part: nothing is counted for what is held of them."""
+    """Return the number of landmarks that are held, wholly or in part."""
     free = (layout.problem.variables[e.group].free_coordinates() for e in layout.eliminated)
     return sum(int((~one).any(axis=1).sum()) for one in free if one is not None)
 

@@ -74,7 +74,7 @@ def solve(
     progress
         Called with an :class:`Iteration` after every step tried; return False to stop.
     layouts
-        For one solve after the other of the same problem, at other states or under other losses: what is common to
+        For a sequence of solves of the same problem, at other states or under other losses: what is common to
         them is found once.
 
     Returns
@@ -122,7 +122,7 @@ def minimise(
 ) -> Termination:
     """Step until a criterion is met, and return which; the states are the problem's own.
 
-    A loop that is given where an earlier one was ``standing`` goes on from there. ``keep`` is called after every
+    A loop that gets the ``standing`` of an earlier one resumes there. ``keep`` is called after every
     accepted step.
     """
     best = problem.start()

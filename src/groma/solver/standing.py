@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Where the loop stands after a step: what it needs to go on later, besides the problem at its states."""
+"""The state of the loop after a step: what it needs to resume, besides the problem at its states."""
 
 from __future__ import annotations
 
@@ -18,5 +18,5 @@ class Standing:
     fell: float
     #: All steps so far.
     history: tuple[Iteration, ...]
-    #: Why the loop ended with this step; None if it goes on.
+    #: Reason of termination after this step; None: it continues.
     ended: Termination | None = None

@@ -13,7 +13,7 @@ from groma.geometry.manifold import Manifold
 from groma.problem.layout import Layout
 
 States = dict[str, FloatArray]
-#: About so many states of a group are looked at for the one of middle length (Cost: time only).
+#: Approximate number of states of a group whose median length is taken (Cost: time only).
 SAMPLE = 4096
 
 

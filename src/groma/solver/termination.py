@@ -93,7 +93,7 @@ class Termination(Enum):
 
 
 def cost_converged(decrease: float, previous: float, gain_ratio: float, withheld: float, tolerance: float) -> bool:
-    r"""Whether the cost has converged after an accepted step: it fell, or would fall next, by too little to go on.
+    r"""Whether the cost has converged after an accepted step: it fell, or would fall next, by too little to continue.
 
     What the next step will bring is known well enough without taking it. Steps shrink by the ratio they have shrunk
     by, or by what the quadratic model was wrong, whichever is more; and what the damping has held back,
@@ -125,7 +125,7 @@ def cost_converged(decrease: float, previous: float, gain_ratio: float, withheld
 
 
 def is_beyond_cost(trial: Trial, best: Trial) -> bool:
-    r"""Whether a step promises less than the rounding of the cost, so that the cost cannot tell whether it is good.
+    r"""Whether a step promises less than the rounding of the cost, so that the cost cannot decide whether it is good.
 
     The gradient still can: it is exact to more digits. Near the minimum the cost F says nothing of states within
     :math:`\sqrt{2 \epsilon F}` standard deviations. Such a step is taken without asking the cost.
@@ -142,7 +142,7 @@ class Criteria:
         self._options = options
         #: Relative decrease in the last step, 0 where it was refused.
         self.fell = 0.0
-        #: What the last step promised, where the cost cannot tell.
+        #: Predicted decrease of the last step, where the cost cannot decide.
         self._promised = np.inf
 
     def after_accepted(self, trial: Trial, best: Trial) -> Termination | None:
@@ -150,7 +150,7 @@ class Criteria:
         if trial.settled is not None:
             return Termination.COST_CONVERGED if trial.settled else None
         tolerance = self._options.function_tolerance
-        if is_beyond_cost(trial, best):  # on, where that is wanted, as long as the gradient gets smaller
+        if is_beyond_cost(trial, best):  # if configured, continue as long as the gradient decreases
             before, self._promised = self._promised, trial.promised
             smaller = tolerance == 0.0 and trial.promised < 0.25 * before
             return None if smaller and trial.relative_length > NO_CHANGE else Termination.COST_CONVERGED

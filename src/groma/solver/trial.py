@@ -25,7 +25,7 @@ class JointTrial(Trial):
 
 
 def evaluated(equations: NormalEquations, states: States) -> dict:
-    """Evaluate the cost at some states; return the fields of :class:`JointTrial` that tell of it."""
+    """Evaluate the cost at some states; return the fields of :class:`JointTrial` about it."""
     inputs = equations.prepare(states)
     cost = equations.cost(inputs)
     return {"states": states, "inputs": inputs, "cost": cost, **counted_in(equations)}

@@ -61,7 +61,7 @@ def with_kept(covariances: Covariances, group: str, index: int) -> dict[str, Flo
     free = ~np.concatenate(covariances._held)[:, None]
     solved = covariances._solve(R * free) * free
     found = {name: solved[at] for name, at in rows.items()}
-    for tied in covariances._divided.tied:  # what is eliminated of their group is not asked for
+    for tied in covariances._divided.tied:  # the eliminated part of their group is not included
         found.setdefault(tied.group, np.zeros((int((~tied.is_tied).sum()), groups[tied.group].manifold.dof, own)))
     return covariances._divided.join(found)
 

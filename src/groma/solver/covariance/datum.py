@@ -33,7 +33,7 @@ from groma.solver.linear.blocks import Blocks, multiply
 from groma.solver.linear.schur import ReducedSystem
 from groma.solver.steps import Step
 
-#: A world motion counts as free when the cost it causes is below this fraction of what its size would suggest.
+#: A world motion counts as free if its cost is below this fraction of the one expected from its size.
 FREE_TOLERANCE = 1e-9
 #: Singular values below this fraction of the largest do not count.
 RANK_TOLERANCE = 1e-9
@@ -93,7 +93,7 @@ def free_motions(layout: Layout, equations: NormalEquations, system: ReducedSyst
         gram, size = (combinations.T @ M @ combinations for M in (gram, size))
         scale = 1.0 / np.sqrt(np.maximum(np.diag(size), 1e-300))
         values, vectors = np.linalg.eigh(gram * scale[:, None] * scale)
-        # an eigenvector is free if it costs little compared with what its size would suggest
+        # an eigenvector is free if its cost is small for its size
         expected = np.einsum("ik,ij,jk->k", vectors, size * scale[:, None] * scale, vectors)
         combinations = combinations @ (scale[:, None] * vectors)[:, values < FREE_TOLERANCE * expected]
     return FreeMotions(
@@ -138,7 +138,7 @@ def constrained(layout: Layout, S: Blocks, G: FloatArray) -> Blocks:
 def middle_and_extent(problem: Problem, most_points: int | None = None) -> tuple[FloatArray, float]:
     """Middle (3,) and extent of the points and cameras of a problem, to which motions are referred.
 
-    Of each group at most so many points are looked at, evenly spread; all if None.
+    Maximum number of points of each group, evenly spread; None: all.
     """
     places = [np.zeros((0, 3))]
     for group in problem.variables.values():
@@ -184,7 +184,7 @@ def unmoved(motions: FloatArray, length: float) -> FloatArray:
 
 
 def moves_anything(size: FloatArray, combinations: FloatArray) -> BoolArray:
-    """Return which combinations (7, k) move what is measured; a problem of directions alone has no translation.
+    """Return the combinations (7, k) that move the variables; a problem of directions alone has no translation.
 
     ``size`` (7, 7) is what the motions would cost if every unknown moved alone: squares, and free of units.
     """
@@ -193,7 +193,7 @@ def moves_anything(size: FloatArray, combinations: FloatArray) -> BoolArray:
 
 
 def _costs_of_incidences(problem: Problem, motions: dict[str, FloatArray]) -> FloatArray:
-    """Return the part of J^T J (7, 7) that factors have by what is left of residuals that should be zero.
+    """Return the part of J^T J (7, 7) due to non-zero residuals of invariant factors.
 
     Landmarks on others cost less in a smaller scene, by what they miss each other: that is no knowledge of its scale.
     """

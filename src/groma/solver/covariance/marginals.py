@@ -315,7 +315,7 @@ class Covariances:
         return sigma if basis is None else basis @ sigma @ np.swapaxes(basis, 1, 2)
 
     def joint(self, variables: Sequence[Variable]) -> FloatArray:
-        """Return the joint covariance of some variables, increments one after the other.
+        """Return the joint covariance of some variables, by concatenated increments.
 
         Each costs one solve with the factorised system per degree of freedom; the variables need not share anything.
         """

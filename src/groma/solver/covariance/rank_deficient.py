@@ -97,7 +97,7 @@ def hold_unobservable_blocks(
 
 
 def zero_modes(layout: Layout, fronts: Fronts, S: Blocks) -> Modes:
-    """Return the smallest modes of a scaled system, so many that not all of them are of zero cost, if that can be."""
+    """Return the smallest modes of a scaled system: all of zero cost and, if possible, at least one more."""
     count, most = MODES, min(MAX_MODES, layout.num_kept_unknowns)
     modes = smallest(layout, fronts, S, count)
     while modes.num_null == count < most:
@@ -116,7 +116,7 @@ def loses_the_cameras(layout: Layout, modes: Modes) -> bool:
 
 
 def deficiency(layout: Layout, modes: Modes, num_free: int) -> ProblemError:
-    """Return the error that says how many directions are unobservable, and what they move.
+    """Return the error with the number of unobservable directions and what they move.
 
     ``num_free`` of them are motions of the whole scene that nothing holds.
     """

@@ -47,7 +47,7 @@ def _tree(pointer, column, parent):
 
 @kernel
 def _reach(pointer, column, parent, i, mark, stack, path):
-    """Write the columns of row i of L to the end of ``stack``, children before parents; return where they begin."""
+    """Write the columns of row i of L to the end of ``stack``, children before parents; return their start."""
     n = parent.shape[0]
     top = n
     mark[i] = i

@@ -37,7 +37,7 @@ CLUSTER_SIZE = 24
 MAX_CLUSTERS = 64
 #: Fewer clusters than this are not worth it (cost: time only).
 MIN_CLUSTERS = 4
-#: Added to the diagonal of the coarse system, relative: a camera alone cannot tell all seven motions apart.
+#: Relative addition to the diagonal of the coarse system: a single camera does not determine all seven motions.
 JITTER = 1e-10
 #: The coarse system is kept while the motions have changed by less than this share of the largest since it was formed
 #: (cost: time only).

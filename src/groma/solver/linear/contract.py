@@ -79,5 +79,5 @@ def keeps_poses_alone(layout: Layout) -> bool:
 
 
 def is_pose_graph(layout: Layout) -> bool:
-    """Whether nothing is eliminated, and what is kept are poses of one kind."""
+    """Whether nothing is eliminated and all blocks are poses of one kind."""
     return not layout.eliminated and len(layout.kept) == 1 and keeps_poses_alone(layout)

@@ -44,7 +44,7 @@ FULL_SHARE = 0.4
 FEW_BLOCKS = 12
 #: A front joins its parent where its columns get longer by at most this share (cost: time alone).
 EXTRA_ZEROS = 0.15
-#: Fronts without children that eliminate at most so many unknowns are done many at once (cost: time alone).
+#: Leaf fronts that eliminate at most this many unknowns are processed in batches (cost: time alone).
 LEAF_SIZE = 8
 
 
@@ -256,7 +256,7 @@ class Fronts:
 
 
 def _ranges(starts: IntArray, widths: IntArray) -> IntArray:
-    """Return start, start + 1, ..., start + width - 1 for each start, one after the other."""
+    """Return the concatenated ranges start, ..., start + width - 1."""
     ends = np.cumsum(widths)
     return np.arange(int(ends[-1]) if len(ends) else 0) + np.repeat(starts - (ends - widths), widths)
 

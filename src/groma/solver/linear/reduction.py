@@ -44,7 +44,7 @@ class Reduction:
         return cost
 
     def form(self, states: States, inputs: list[tuple], damping: float) -> None:
-        """Do what is missing of :meth:`linearize`: for another damping alone, landmarks are eliminated again.
+        """Do the missing part of :meth:`linearize`: for another damping, landmarks are eliminated again.
 
         Compact equations are linearised for that, too.
         """

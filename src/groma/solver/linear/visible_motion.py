@@ -21,7 +21,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.geometry.manifold import Manifold
 from groma.problem.problem import Problem
 
-#: Kinds of variables that cameras look at.
+#: Kinds of variables that cameras observe.
 SEEN = ("point", "line", "plane", "direction")
 
 

@@ -48,5 +48,5 @@ def few(parts: list[str], most: int = DIAGNOSIS.examples) -> str:
 
 
 def first_upper(text: str) -> str:
-    """Return a text that begins with a capital."""
+    """Return a text with a capital first letter."""
     return text[:1].upper() + text[1:]

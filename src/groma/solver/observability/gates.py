@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Thresholds of the diagnosis: what is said, and of which variables. No estimate depends on them."""
+"""Thresholds of the messages of the diagnosis. No estimate depends on them."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""One linearisation of a problem, as the parts of a diagnosis look at it.
+r"""One linearisation of a problem, shared by the parts of a diagnosis.
 
 Free motions of the whole scene are sought in the reduced system S first: eliminated landmarks follow the cameras as
 well as they can there, so a motion G of the kept variables is one of the whole scene exactly if :math:`G^\top S\,G` is
 zero. That costs next to nothing, whatever the number of landmarks. But S carries the rounding of all landmarks, of far
-points above all; where that leaves a doubt, the normal equations with the landmarks are asked.
+points above all; in case of doubt, the normal equations with the landmarks are used.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from groma.solver.observability.messages import Names
 
 @dataclass(frozen=True)
 class Inspection:
-    """A problem, its linearisation at its states, and what is derived from both where it is needed."""
+    """A problem, its linearisation at its states, and quantities derived on demand."""
 
     problem: Problem
     #: The same with landmarks that are tied to others apart, and how that is laid out.

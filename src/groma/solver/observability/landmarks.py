@@ -34,7 +34,7 @@ class _Landmarks:
     shaky: BoolArray
 
     def finding(self, code: str, severity: str, which: BoolArray, one: str, many: str, remedy: str) -> list[Finding]:
-        """Say of some landmarks what is wrong, in words for one and for many; nothing of none."""
+        """Return the finding about some landmarks, in words for one and for many; none without landmarks."""
         bad = np.flatnonzero(which)
         if len(bad) == 0:
             return []
@@ -243,7 +243,7 @@ def _line_geometry(inspection: Inspection, name: str, seen: Observers) -> tuple[
     ray = at[seen.variable] - centers[seen.pose]
     normal = np.cross(ray, d[seen.variable])
     size, away = np.linalg.norm(normal, axis=1), np.maximum(np.linalg.norm(ray, axis=1), 1e-300)
-    # a ray along the line has almost no plane; what little there is says nothing
+    # a ray along the line has almost no plane
     sees_side = size > np.sin(DIAGNOSIS.end_on) * away
     end_on = np.bincount(seen.variable, weights=sees_side, minlength=len(group)) == 0
     planes = _scatter(normal / np.maximum(size, 1e-300)[:, None] * sees_side[:, None], seen.variable, len(group))

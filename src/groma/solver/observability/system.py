@@ -47,7 +47,7 @@ def separate_parts(inspection: Inspection) -> list[Finding]:
 
 
 def unseen_variables(inspection: Inspection) -> tuple[list[Finding], set[tuple[str, int]]]:
-    """Find variables of which the data say nothing at all."""
+    """Find variables without any information from the data."""
     findings, found = [], set()
     unseen = _unseen(inspection)
     for c in inspection.layout.kept:
@@ -127,9 +127,9 @@ def _unseen(inspection: Inspection) -> BoolArray:
 
 
 def _with_open_coordinates(inspection: Inspection, unseen: BoolArray) -> Blocks:
-    """Return S without the ones on the diagonal that stand for coordinates of which the data say nothing.
+    """Return S without the ones on the diagonal of coordinates without information.
 
-    Variables of which the data say nothing at all keep them; they are reported on their own.
+    Variables without any information keep them; they are reported separately.
     """
     S = dict(inspection.system.S)
     for c, kept in enumerate(inspection.layout.kept):
@@ -147,7 +147,7 @@ def _excursions(inspection: Inspection, modes: Modes, size: FloatArray) -> dict[
     sigma = 1.0 / np.sqrt(np.maximum(modes.values, LEAST))
     steps = modes.vectors * (1.0 / size)[:, None]
     steps *= sigma
-    steps[np.concatenate(inspection.held[0])] = 0.0  # ones on the diagonal say nothing in any unit
+    steps[np.concatenate(inspection.held[0])] = 0.0  # ones on the diagonal have no unit
     result = {}
     for c in inspection.layout.kept:
         if inspection.layout.problem.variables[c.members[0].group].manifold.kind in ("point", "line"):

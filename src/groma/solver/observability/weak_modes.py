@@ -21,7 +21,7 @@ from groma.solver.linear.modes import MAX_SHIFT, MODES, ROUNDS, SHIFT, Modes, sm
 if TYPE_CHECKING:
     from scipy.sparse import csc_array, csr_array
 
-#: Systems of up to so many unknowns are decomposed completely (cost: time alone).
+#: Maximum number of unknowns of systems that are decomposed completely (cost: time alone).
 DENSE = 300
 #: Directions of a landmark whose scaled information is below this share of the largest are left alone.
 LANDMARK_TOLERANCE = 1e-11
@@ -101,10 +101,10 @@ def _without(
 
 
 def _datum(layout: Layout, size: FloatArray, G: FloatArray) -> Blocks:
-    """Return projections, on the diagonal, on what is held: one camera, and of others what that leaves free.
+    """Return the projections, on the diagonal, onto the held coordinates: one camera, and part of others.
 
     :func:`groma.solver.covariance.datum.constrained` spreads its constraints over cameras as suits the factorisation.
-    Here the frame must be one that a reader would choose, because what is said of cameras is relative to it.
+    The frame must be a natural one, because findings about cameras are relative to it.
     """
     datum = {(c, c): np.zeros((len(layout.blocks[c, c][0]), k.width, k.width)) for c, k in enumerate(layout.kept)}
     kinds = [layout.problem.variables[c.members[0].group].manifold.kind for c in layout.kept]

@@ -9,7 +9,7 @@ from groma._typing import ComplexArray, IntArray
 
 
 class Reducer(Protocol):
-    """Combines what processes found that solve one problem together, each with shards of its own.
+    """Combines the sums of processes that solve one problem together, each with some of the shards.
 
     All processes call the same methods in the same order, and all get the same results. Arrays hold *exact sums*
     (:mod:`groma.solver.reduce.exact_sums`), so that the result does not depend on who has which shard.

@@ -15,16 +15,16 @@ class Waypoint:
     """Where a solve in shards stands after an accepted step, besides the states."""
 
     standing: Standing
-    #: The damping of the next step, and what the last one tells of it: its gain ratio, and the curvature it found.
+    #: The damping of the next step, and the gain ratio and curvature of the last one.
     damping: float
     last_ratio: float
     curvature: float
 
 
 class Journal(Protocol):
-    """Keeps where a solve stands, so that another one can go on from there."""
+    """Saves the state of a solve, so that another one can resume."""
 
-    #: Where the solve begins, whose states the variables then have; None: at its start.
+    #: State from which the solve resumes, which the variables then have; None: the start.
     begin: Waypoint | None
 
     def keep(self, states: States, waypoint: Waypoint) -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Processes on one machine or on many that solve one problem together, by MPI.
 
-A launcher (``mpiexec``, ``srun``) starts the same command several times and tells each process its number, the rank. In
+A launcher (``mpiexec``, ``srun``) starts the same command several times and gives each process its number, the rank. In
 a step every rank visits its own shards, and one Allreduce of one buffer sums what they found; all then solve the same
 shared system. mpi4py is imported here, and only where there is more than one rank.
 """
@@ -24,7 +24,7 @@ from groma.solver.reduce import exact_sums
 from groma.solver.reduce.alone import Alone
 from groma.solver.reduce.contract import Reducer
 
-#: Where launchers say the rank and the number of ranks: MPICH and its kin, Open MPI, srun --mpi=pmix.
+#: Environment variables of the rank and the number of ranks: MPICH and its kin, Open MPI, srun --mpi=pmix.
 LAUNCHERS = (
     ("PMI_RANK", "PMI_SIZE"),
     ("OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_SIZE"),
@@ -40,7 +40,7 @@ _PASSING_ON_SECONDS = 0.2
 
 
 def started_as(environment: Mapping[str, str] = os.environ) -> tuple[int, int]:
-    """Return rank and number of ranks as a launcher told them; (0, 1) for a process that was started alone."""
+    """Return rank and number of ranks set by a launcher; (0, 1) for a process without one."""
     for rank, size in LAUNCHERS:
         if environment.get(rank, "").isdigit() and environment.get(size, "").isdigit():
             return int(environment[rank]), int(environment[size])
@@ -74,7 +74,7 @@ class Ranks:
             )
         self.num_neighbours, self.num_cores = self._share_of_machine()
         self._add: Any = MPI.Op.Create(_add, commute=True)
-        #: Bytes that this rank gave to the largest sum, and to all: what it sends and receives, up to twice.
+        #: Bytes of this rank in the largest sum, and in all; it sends and receives up to twice as many.
         self.bytes_per_sum = self.bytes_summed = 0
 
     def sum(self, values: ComplexArray) -> ComplexArray:  # noqa: D102
@@ -113,7 +113,7 @@ class Ranks:
         return context
 
     def abort(self) -> None:
-        """End all ranks at once: one of them cannot go on, and the others would wait for it."""
+        """End all ranks: one of them has failed, and the others would wait for it."""
         time.sleep(_PASSING_ON_SECONDS)
         self._world.Abort(1)
 

@@ -56,7 +56,7 @@ class Shelf:
         self._kept: dict[int, OpenShard] = {}
 
     def open(self, shard: Shard, states: States) -> OpenShard:
-        """Return a shard as a problem of its own, laid out at given states."""
+        """Return a shard as a separate problem, laid out at given states."""
         known = self._kept.get(id(shard))
         if known is not None:
             problem = known.layout.problem.with_states(self._states_of(shard, states))

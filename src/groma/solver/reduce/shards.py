@@ -91,7 +91,7 @@ def solve_shards(
     room
         Bytes of memory for shards that stay from one visit to the next.
     journal
-        Where the solve begins, if not at its start, and who keeps where it stands.
+        State to resume from, and the place where states are saved.
 
     Returns
     -------
@@ -178,7 +178,7 @@ class ShardedProblem:
         return self._here.states
 
     def go_on_from(self, waypoint: Waypoint) -> None:
-        """Take over what an earlier solve had learnt, at whose states this one begins."""
+        """Take over the damping state of an earlier solve, at whose states this one starts."""
         self._damping.value = waypoint.damping
         self._last_ratio, self._curvature = waypoint.last_ratio, waypoint.curvature
 
