@@ -153,7 +153,7 @@ class Parallel:
 
 
 def crossings(pool: Perpendicular, count: int, min_sine: float, rng: np.random.Generator) -> FloatArray:
-    """Candidates: cross products of so many pairs of normals, drawn by their certainty."""
+    """Candidates: cross products of random pairs of normals, drawn by their certainty."""
     certainty = 1.0 / np.sqrt((pool.factors**2).sum(axis=(1, 2)) + pool.sigma**2)
     pairs = rng.choice(len(pool), (count, 2), p=certainty / certainty.sum())
     crossed = np.cross(pool.normals[pairs[:, 0]], pool.normals[pairs[:, 1]])

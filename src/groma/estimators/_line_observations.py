@@ -44,14 +44,14 @@ class LineTriangulation:
     residual: FloatArray
     #: (L,) :class:`TriangulationStatus`.
     status: IntArray
-    #: (L, 6, 6) covariance of ``line`` from unit weights in pixels, rank 4; None unless asked for.
+    #: (L, 6, 6) covariance of ``line`` from unit weights in pixels, rank 4; None unless requested.
     covariance: FloatArray | None = None
     #: (L,) number of steps of the refinement.
     iterations: IntArray | None = None
 
 
 def checked_pointers(line_pointers: IntArray, count: int) -> IntArray:
-    """Pointers that rise from 0 to the number of observations, or an error that says what is wrong."""
+    """Pointers that rise from 0 to the number of observations; raise unless they are valid."""
     pointers = np.asarray(line_pointers)
     if pointers.ndim != 1 or len(pointers) == 0 or not np.issubdtype(pointers.dtype, np.integer):
         raise ShapeError(
@@ -86,7 +86,7 @@ def camera_centers(cameras: FloatArray) -> FloatArray:
 def checked_observations(
     cameras: FloatArray, image_idx: IntArray, segments: FloatArray, pointers: IntArray
 ) -> tuple[FloatArray, IntArray, FloatArray, IntArray]:
-    """Camera matrices, image indices, segments and pointers that fit together, or an error that says what is wrong."""
+    """Consistent camera matrices, image indices, segments and pointers; raise unless they are valid."""
     cameras, segments = matrices(cameras, 3, 4, "cameras"), vectors(segments, 4, "segments")
     image_idx = np.asarray(image_idx)
     if cameras.ndim != 3 or segments.ndim != 2 or image_idx.shape != (len(segments),):

@@ -36,7 +36,7 @@ from groma.execution import map_in_threads
 from groma.gates import gate
 from groma.geometry.algebra import perpendicular, unit
 
-#: Guesses looked at by one piece of work (cost: memory).
+#: Guesses processed by one task (cost: memory).
 _AT_ONCE = 16
 
 
@@ -74,7 +74,7 @@ class ParallelGates:
         return np.geomspace(0.01 * self.most_px, self.most_px, self.tried)
 
     def quantile(self, share: float) -> float:
-        """Square of the whitened residual that a share of what is parallel does not exceed."""
+        """Square of the whitened residual that a share of parallel features does not exceed."""
         return self.freedom * ((1.0 - share) ** (-2.0 / self.freedom) - 1.0)
 
 
@@ -131,7 +131,7 @@ def parallel_lines(
     candidates: FloatArray,
     wanted: Acceptance,
 ) -> ParallelLines:
-    """Find the directions that lines share; ``turned`` None: ends do not deviate. The rest is said in the module."""
+    """Find the directions that lines share; ``turned`` None: ends do not deviate. See the module."""
     px = np.zeros(1) if turned is None else np.concatenate([[PARALLEL.start_px, 0.0], PARALLEL.deviations])
     turned = np.zeros(len(directions)) if turned is None else turned
     noise = [(angle, one) for angle in np.geomspace(PARALLEL.looser * sigma, sigma, PARALLEL.angles) for one in px]
@@ -148,7 +148,7 @@ def parallel_lines(
     label = np.concatenate([found.probability, nothing]).argmax(axis=0)
     mine = label, np.arange(len(label))
     squared = np.concatenate([found.squared, nothing])[mine]
-    # Student's distribution is normal with a variance of its own for each line: its factor, if the residual tells it.
+    # Student's distribution is normal with a variance for each line: its factor, given the residual.
     factor = np.maximum((PARALLEL.freedom + squared) / (PARALLEL.freedom + 2.0), 1.0)
     angle, deviation = noise[best]
     beyond = (factor - 1.0) * pools[best].area + angle**2 - sigma**2

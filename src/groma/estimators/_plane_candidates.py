@@ -23,9 +23,9 @@ from groma.estimators._plane_options import PLANE_SEARCH
 from groma.execution import map_in_threads, num_threads
 from groma.geometry.algebra import dot, norm
 
-#: Pairs looked at together (cost: memory).
+#: Pairs processed together (cost: memory).
 _CHUNK = 4096
-#: Features, or up to twice as many, that tell whether two planes are the same (cost: time only).
+#: Features, or up to twice as many, by which two planes are compared (cost: time only).
 _JUDGES = 64
 #: Candidates that are worth a thread: one takes a hundredth of a millisecond, and handing over a tenth. And pieces for
 #: each thread, as some candidates take longer than others (cost: time only).
@@ -61,7 +61,7 @@ class Features:
 
 
 def features_of(places: FloatArray, noise: FloatArray, partner: IntArray, carrier: IntArray) -> Features:
-    """Return places (N, 3) of points and segment ends with their covariances (N, 3, 3), and what is near what."""
+    """Return places (N, 3) of points and segment ends, their covariances (N, 3, 3), and their neighbourhoods."""
     near = min(PLANE_SEARCH.neighbours, len(places))
     tree = kd_tree(places)
     given = np.asarray(tree.indices, dtype=np.int64)
@@ -262,8 +262,9 @@ def scores_loop(features, labels, gate, reach, planes, homes, which, stamp, numb
 def keep_others_loop(features, rows, plane, planes, same, first_at, at, mark, alive):
     """Take candidates near rows that would end at their plane off those that are ``alive`` (H,).
 
-    Those are where half of some rows, or more, are within so many standard deviations. Candidates ``at[first_at[i]]``
-    to before ``at[first_at[i + 1]]`` are at home at feature i. ``mark`` (N,) holds -1, and does so again.
+    They are equal if half of some rows, or more, are within this many standard deviations. Candidates
+    ``at[first_at[i]]`` to before ``at[first_at[i + 1]]`` are at home at feature i. ``mark`` (N,) holds -1, and does so
+    again.
     """
     places, packed, neighbours = features[0], features[1], features[5]
     spread = np.empty(len(rows))

@@ -152,7 +152,7 @@ def _polished_loop(features, rows, band, gates, mark, layer, joined, numbers, pl
 
 @loop
 def _grow_loop(features, labels, gates, others, mark, room, joined, numbers, plane, center):
-    """Refine and polish a plane; return its number of features, half thickness, and what its layer holds and shares."""
+    """Refine and polish a plane; return its number of features, half thickness, and the counts of its layer."""
     count, band = _refined_loop(features, labels, gates, mark, room, numbers, plane)
     inner, share = 0, 0.0
     if band > 0.0:
@@ -176,7 +176,7 @@ class Grown:
 
 
 class Grower:
-    """Grows candidates, one after the other, on the same features; keeps the room it works in.
+    """Grows candidates on the same features; reuses its buffers.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ class Grower:
         self._polishing = GATES.link, GATES.inlier, least, ROUNDS, GATES.polish_steps, GATES.fit_rounds
 
     def grow(self, plane: FloatArray, home: int, labels: IntArray) -> tuple[Grown | None, FloatArray, IntArray]:
-        """Refine a candidate where it is connected, and judge it: what is kept, where it went, its support.
+        """Refine a candidate where it is connected, and test it: its rows, the refined plane, its support.
 
         It grows from the neighbourhood of its ``home``, a feature: what lies on the same plane far away is another's.
         """
@@ -223,7 +223,7 @@ class Grower:
             return None, plane, rows
         precision, weight = self._numbers[2, :inner], self._numbers[3, :inner]
         fit = fit_with_covariance(plane, center, features.places[layer], precision, weight)
-        # The whole layer is taken out: relief so near to a plane cannot be told from it.
+        # The whole layer is taken out: relief so near cannot be distinguished from the plane.
         taken = np.union1d(rows, layer[labels[layer] < 0])
         return Grown(fit, share, band, alarm, features.places[rows], taken), plane, rows
 

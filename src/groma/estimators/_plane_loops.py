@@ -20,7 +20,7 @@ from groma._numba import kernel, loop
 BALL, _BOX = 64, 8
 #: Sweeps of Jacobi rotations: convergence is quadratic, four are enough (cost: none are made after convergence).
 _SWEEPS = 12
-#: What is as far away as is allowed is looked at by distance, not passed over by its square (derived from rounding).
+#: Margin of squared distances, so that features at the limit are compared by distance (derived from rounding).
 _ROUNDING = 1.0 + 1e-12
 
 
@@ -37,7 +37,7 @@ def height_kernel(p, plane):
 
 @kernel
 def lies_on_kernel(i, places, packed, plane, gate):
-    """Whether the squared distance of a point from a plane is below so many variances."""
+    """Whether the squared distance of a point from a plane is below a multiple of its variance."""
     height = height_kernel(places[i], plane)
     return height * height < gate * max(variance_kernel(packed[i], plane[0], plane[1], plane[2]), 1e-300)
 
@@ -233,7 +233,7 @@ def nearest_loop(points, boxes, place, home, bound, nearest, squared):
 
 @loop
 def connected_loop(places, rows, tested, which, spacing, link, plane, out):
-    """Whether tested points (N, 3), projected to a plane, are within so many spacings (N,) of some rows of places.
+    """Whether tested points (N, 3), projected to a plane, are within a multiple of spacings (N,) of rows of places.
 
     Only those ``which`` (K,) are tested; ``out`` (K,) is filled.
     """

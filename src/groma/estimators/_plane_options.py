@@ -21,7 +21,7 @@ class PlaneOptions:
     min_share: float = 0.2
     #: Expected number of planes found where there are none (convention: of tests by meaningfulness).
     max_false_alarms: float = 1e-4
-    #: Where the random choice of candidates begins.
+    #: Random seed of the candidates.
     seed: int = 0
 
 

@@ -9,7 +9,7 @@ and its standard deviation s,
 .. math:: P = \frac{\pi\, g(h; s)}{\pi\, g(h; s) + (1 - \pi)/B}, \qquad
           g(h; s) = \sqrt{\tfrac{2}{\pi_0}}\,\frac1s e^{-h^2/2s^2}, \quad \pi_0 = 3.14\ldots
 
-The shares follow by expectation maximisation. A feature with :math:`s \ge B` tells nothing and never reaches a high
+The shares follow by expectation maximisation. A feature with :math:`s \ge B` is uninformative and never reaches a high
 probability.
 """
 
@@ -131,7 +131,7 @@ def maximise_shares(
 
 
 def _firsts(owner: IntArray, num: int) -> IntArray:
-    """Where the features of each structure begin, those of the first at first, and the number of all (K + 1,)."""
+    """Bounds (K + 1,) of the features of each structure."""
     return np.r_[0, np.cumsum(np.bincount(owner, minlength=num))]
 
 

@@ -12,17 +12,17 @@ every problem
         until the cost fell                         (damping * 10 after a failure, / 10 after a success)
     until it hardly fell
 
-under a Cauchy loss, if wanted. It is the loop of :func:`groma.solver.solve.minimise` for problems so small that calling
+optionally under a Cauchy loss. It is the loop of :func:`groma.solver.solve.minimise` for problems so small that calling
 Python once for each would take longer than solving them.
 
 A kind of problem is three kernels, and is registered with a number (:func:`problem_kind`)::
 
-    frame(x, B)                         write to B what the two other kernels need to know at the state x
+    frame(x, B)                         write to B the quantities at the state x that the two other kernels need
     residuals(shared, k, own, m, x, B, r, J)
                                         write the residuals of an observation and their derivatives by a step
     move(x, B, step, out)               write the state after a step
 
-An observation has a row of numbers of its own, ``own[m]`` (a segment), and one that it may share with others,
+An observation has its own row of numbers, ``own[m]`` (a segment), and one that it may share with others,
 ``shared[k]`` (its camera). The arrays are passed whole: views of rows would take half of the time.
 
 The loop takes the kind as a tuple of ``None`` whose length is the number, so it is compiled for each kind and calls the
@@ -236,7 +236,7 @@ class Observations:
     shared_idx: IntArray
     #: (M, ...) what each observation has for itself.
     own: FloatArray
-    #: (N + 1,) where the observations of each problem begin and end.
+    #: (N + 1,) bounds of the observations of each problem.
     pointers: IntArray
     #: (M,) whether they take part.
     active: BoolArray
@@ -269,7 +269,7 @@ def problem_kind(
     residuals: Callable[..., None],
     move: Callable[..., None],
 ) -> ProblemKind:
-    """Register a kind of problem under a number of its own; its kernels are made with ``groma._numba.kernel``."""
+    """Register a kind of problem under a new number; its kernels are made with ``groma._numba.kernel``."""
     known = _RESIDUALS.get(number)
     if number < 1 or (known is not None and known is not residuals):
         raise InputError(f"The number of a kind of problem must be positive and its own; got {number}.")
@@ -295,7 +295,7 @@ def solve_batch(
     observations
         Of all problems.
     states : (N, ...) float64
-        Where each problem begins; not changed.
+        Initial states; not changed.
     max_steps
         Most steps of a problem.
     tolerance, floor

@@ -90,7 +90,7 @@ class DirectionOptions:
     max_directions: int = 24
     #: Directions whose standard deviation is larger are dropped, radians. 2 degrees.
     max_sigma: float = 0.035
-    #: Where the random choice of candidates begins.
+    #: Random seed of the candidates.
     seed: int = 0
 
 
@@ -275,10 +275,10 @@ def _search(
     groups: IntArray | None,
     candidates: FloatArray | None,
 ) -> DirectionSet:
-    """Take directions one after the other; see the module."""
+    """Find directions one by one; see the module."""
     rng = np.random.default_rng(options.seed)
     gate = chi_square_gate(1.0 - options.level, 1)
-    # Features out to where one in 10^4 ends are taken out together: what is left must not repeat the direction.
+    # Features up to the 10^-4 quantile are taken out, too, so that the rest does not repeat the direction.
     wide = chi_square_gate(1.0 - DIRECTIONS.taken, 1)
     tried = max(len(features), 2) ** 2
     remaining = np.arange(len(features))

@@ -29,7 +29,7 @@ _MIN_IMAGES = 2
 
 @kernel
 def _joined(image, low, high, size, same_end):
-    """Join what one image shows, across breaks within the noise of ends; return image, begin, end of each piece."""
+    """Join the segments of one image across gaps within the noise of ends; return image, start, end of each piece."""
     count = len(image)
     owner, first, last = np.empty(count, np.int64), np.empty(count), np.empty(count)
     found = 0

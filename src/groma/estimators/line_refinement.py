@@ -88,7 +88,7 @@ def refine_lines(
     segments : (M, 4) float64
         Measured segments [x1, y1, x2, y2], pixels, undistorted. Rows that are not finite are ignored.
     line_pointers : (L + 1,) int
-        Where each line's observations begin and end.
+        Bounds of the observations of each line.
     weights : (M,) float64, optional
         One over the standard deviation of the distances, 1/pixels. Default: one.
     max_iterations : int

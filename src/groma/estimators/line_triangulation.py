@@ -216,7 +216,7 @@ def triangulate_planes(
     planes : (M, 4) float64
         Back-projected planes, one per observation, of any scale. Rows that are zero or not finite are ignored.
     line_pointers : (L + 1,) int
-        Where each line's observations begin and end.
+        Bounds of the observations of each line.
     centers : (M, 3) float64
         Camera centres, for the choice of origin and unit.
     weights : (M,) float64, optional

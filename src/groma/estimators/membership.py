@@ -2,9 +2,9 @@
 r"""Which features belong to a structure that is not exact: a mixture whose members deviate from it, as do real walls.
 
 A plane of a building is no plane, and its joints are not quite parallel. How far its members are off, beyond their own
-noise, is not known in advance; features tell it, together with the share of them that are members. With the offset
-:math:`x` of a feature in the axes of its noise, variances :math:`s_a^2` there, and what the unit of deviation is at the
-feature, :math:`\ell`, members of a structure with the deviation t have the density
+noise, is not known in advance; it is estimated from the features, together with the share of them that are members.
+With the offset :math:`x` of a feature in the axes of its noise, variances :math:`s_a^2` there, and the unit of deviation
+:math:`\ell` at the feature, members of a structure with the deviation t have the density
 
 .. math:: g(x; t) = \prod_a N(x_a;\; 0,\; s_a^2 + t^2 \ell^2),
 
@@ -109,7 +109,7 @@ def averaged_memberships(found: Candidates, most: FloatArray, worth: FloatArray)
     found, most
         As :func:`memberships` has them.
     worth : (K,) float64
-        What a feature of each structure tells of the deviation, as a share of an independent one.
+        Information of a feature of each structure about the deviation, as a share of that of an independent one.
 
     Returns
     -------

@@ -21,7 +21,7 @@ from groma.errors import InputError, ShapeError
 from groma.estimators._plane_loops import fit_loop
 from groma.geometry.algebra import perpendicular, vectors
 
-#: Root of the information about what points do not tell at all; its inverse is squared, and still a number.
+#: Root of the information about what points do not determine; the square of its inverse is still finite.
 _UNKNOWN = 1e-140
 
 

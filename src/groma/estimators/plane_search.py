@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Several planes in uncertain points and segments, found one after the other.
+r"""Several planes in uncertain points and segments, found one by one.
 
 The search draws planes from neighbours in space (and from pairs of segments that are nearly coplanar), improves each on
 its neighbourhood, scores it by what lies on it there, and takes planes out one after the other, the best first. A plane
@@ -156,7 +156,7 @@ def _extract(
     options: PlaneOptions,
     progress: Callable[[int, int], None],
 ) -> list[Grown]:
-    """Take planes out one after the other; ``filled`` gets their numbers."""
+    """Find planes one by one; ``filled`` gets their numbers."""
     rng = np.random.default_rng(options.seed)
     features = features_of(places, noise, partner, carrier)
     labels = np.full(len(places), -1)
@@ -168,7 +168,7 @@ def _extract(
     support, score = scores.of(np.arange(len(candidates)), labels)
     log_tried = np.log10(PLANE_SEARCH.refined * (len(first) + num_pairs) + 1.0)
     found: list[Grown] = []
-    # With less information than the test of false alarms asks for, a candidate has little hope.
+    # With less information than the test of false alarms needs, a candidate will be rejected.
     least_score = np.log(10.0) * (log_tried - np.log10(options.max_false_alarms))
     alive = (support >= 0.5 * options.min_support) & (score >= least_score)
     queue = [(-float(score[k]), int(k)) for k in np.flatnonzero(alive)]

@@ -12,7 +12,7 @@ in the image
     :math:`l_\perp = x \times [l_1, l_2, 0]^\top`, :math:`\pi = P^\top l_\perp`, :math:`X = L\,\pi`. Consistent with a
     residual that is a distance in pixels.
 
-Both fail where the ray runs along the line. No result is NaN without a status that says why.
+Both fail where the ray runs along the line. No result is NaN without a status with the reason.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ class SegmentDetector(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ImageView:
-    """What a segment matcher is told about one image."""
+    """The input of a segment matcher for one image."""
 
     #: Name of the image.
     name: str

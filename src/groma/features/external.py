@@ -38,7 +38,7 @@ class ExternalMatches:
     matches: Mapping[tuple[str, str], LineMatches]
 
     def match(self, first: str, second: str) -> LineMatches:
-        """Matches of a pair in the order asked for; none where the file has none."""
+        """Matches of a pair in the given order; none if the file has none."""
         if (first, second) in self.matches:
             return self.matches[first, second]
         if (second, first) in self.matches:
@@ -95,7 +95,7 @@ def read_matches(path: str | Path) -> ExternalMatches:
 
 
 def _arrays(path: Path) -> dict[str, Any]:
-    """Arrays of an archive, and what is wrong with it in our own words."""
+    """Arrays of an archive; FileFormatError if it is damaged."""
     try:
         with opened_arrays(path) as members:
             return {key: members.read(key) for key in members.names}

@@ -63,7 +63,7 @@ def to_gray(image: npt.NDArray[np.generic]) -> GrayImage:
 
 
 def one_opencv_thread() -> None:
-    """Let OpenCV do what it is asked for in the thread that asks, from now on.
+    """Let OpenCV work in the calling thread from now on.
 
     Where photographs, or the work on a frame, are shared out among threads, OpenCV's own would come on top of them.
     """

@@ -35,7 +35,7 @@ class LsdDetector:
     fit: bool = True
     #: Join collinear neighbours (see :mod:`groma.features.merging`).
     merge: bool = True
-    #: Keep at most so many, the longest; 0 keeps all.
+    #: Maximum number of segments, the longest; 0: all.
     max_segments: int = 0
 
     def __post_init__(self) -> None:

@@ -59,7 +59,7 @@ class LineMatches:
         return LineMatches(self.pairs[:, ::-1], self.score)
 
     def check(self, num_first: int, num_second: int) -> None:
-        """Raise InputError unless all indices exist in images of so many segments."""
+        """Raise InputError unless all indices are below the numbers of segments of the images."""
         if len(self) and (self.pairs.min() < 0 or (self.pairs.max(axis=0) >= (num_first, num_second)).any()):
             low, high = self.pairs.min(axis=0), self.pairs.max(axis=0)
             raise InputError(

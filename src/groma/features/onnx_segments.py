@@ -76,7 +76,7 @@ class OnnxDetector:
     min_length: float = MIN_LENGTH
     #: Smallest mean gradient across a segment, grey levels (of 255) per pixel.
     min_strength: float = MIN_STRENGTH
-    #: Keep at most so many, the longest; 0 keeps all.
+    #: Maximum number of segments, the longest; 0: all.
     max_segments: int = 0
     #: Hash of the content of the file, so that results are not taken for those of another one.
     content: str = field(init=False, default="")
@@ -186,7 +186,7 @@ def _on_edges(gray: GrayImage, ends: FloatArray) -> tuple[FloatArray, ...]:
 # ------------------------------------------------------------------------------------------------------------ network
 @dataclass(frozen=True, eq=False)
 class _Network:
-    """A session of onnxruntime, and what its input and outputs are called."""
+    """A session of onnxruntime, with the names of its input and outputs."""
 
     session: Any
     #: Where it came from.
@@ -224,7 +224,7 @@ class _Network:
 
 
 def _first_line(error: Exception) -> str:
-    """Return what an error says first."""
+    """Return the first sentence of an error."""
     return (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
 
 

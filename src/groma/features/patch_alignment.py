@@ -2,8 +2,8 @@
 r"""Find patches of one image in another to a few hundredths of a pixel: least-squares matching.
 
 Keypoint detectors place each keypoint by itself; in good photographs the places of one physical point scatter by a
-quarter of a pixel. The grey levels around them say more. A template T, cut from one image about a keypoint, is aligned
-to another image I under an affine map and a gain and an offset of brightness,
+quarter of a pixel. The grey levels around them determine it better. A template T, cut from one image about a keypoint,
+is aligned to another image I under an affine map and a gain and an offset of brightness,
 
 .. math:: \min_{A, c, \alpha, \beta} \sum_x w(x)\, \big(\alpha\, I(c + A x) + \beta - T(x)\big)^2 ,
 
@@ -354,9 +354,9 @@ def align_templates(
     templates : Templates
         From other images.
     template_index : (N,) int
-        The template that each row looks for.
+        The template of each row.
     pixels : (N, 2) float64
-        Where it is looked for, within a pixel or two, pixels.
+        Initial places, exact to a pixel or two, pixels.
     shapes : (N, 2, 2) float64
         Derivative of pixels in this image by pixels of the template, to about a fifth.
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Follow points from image to image by OpenCV's pyramidal Lucas-Kanade, and find new ones worth following.
 
-Where there is nothing but noise, Lucas-Kanade stays near where it was told to begin, and such a point would confirm
+Where there is nothing but noise, Lucas-Kanade stays near its initial place, and such a point would confirm
 whatever was predicted. So patches must be alike, and corners must stand out from the noise of the image.
 
 Pixels count from the corner of the image (first pixel's centre at 0.5, 0.5).
@@ -97,7 +97,7 @@ def follow(
     window : int
         Width of the compared patches, pixels.
     round_trip : float, optional
-        Points must come back to within this distance, pixels; None does not go back.
+        Maximum forward-backward error, pixels; None: no backward pass.
 
     Returns
     -------
@@ -189,7 +189,7 @@ def spread(
 def corners(image: GrayImage, count: int, distance: float) -> FloatArray:
     """Corners (Shi and Tomasi) that noise does not explain, (N, 2) pixels, strongest first."""
     gates = POINT_TRACKS
-    everywhere: Any = None  # OpenCV's types do not say so
+    everywhere: Any = None  # missing in OpenCV's types
     found, strength = cv2.goodFeaturesToTrackWithQuality(
         image, count, gates.quality, distance, everywhere, blockSize=gates.block
     )

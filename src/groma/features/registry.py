@@ -2,7 +2,7 @@
 """Detectors, matchers and retrieval by name: those of groma, those registered, and those of installed packages.
 
 A package offers one by an entry point in the group ``groma.detectors``, ``groma.matchers`` or ``groma.retrieval``; it
-is imported when it is asked for. The entry point names a class or function that is called with the settings below, by
+is imported on demand. The entry point names a class or function that is called with the settings below, by
 keyword, and returns the object. A name that ends in ``:FILE`` stands for any file, which is the setting ``file``.
 
 ============================  ==========================================================  =========================

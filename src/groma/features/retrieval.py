@@ -30,9 +30,9 @@ class GradientRetrieval:
 
     #: Cells of the grid, per side.
     cells: int = 6
-    #: Orientations told apart, from 0 to 180 degrees.
+    #: Bins of orientations from 0 to 180 degrees.
     orientations: int = 8
-    #: The image is reduced to so many pixels per cell and side.
+    #: Pixels per cell and side to which the image is reduced.
     cell_size: int = 16
 
     def __post_init__(self) -> None:
@@ -71,7 +71,7 @@ def most_similar(retrieval: ImageRetrieval, query: Any, others: Sequence[Any], c
     others : sequence
         Descriptions by that retrieval.
     count : int
-        At most so many.
+        Maximum number.
     """
     if not len(others):
         return np.zeros(0, np.int64)

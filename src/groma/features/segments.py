@@ -4,7 +4,7 @@
 Pixels count from the corner of the image: the first pixel's centre is (0.5, 0.5). A segment is directed from its first
 to its second end point so that the **darker side lies to its left** as seen in the image (v pointing down): a person
 walking along it has the dark on the left hand. The same physical edge is therefore directed alike in all images, and
-the two edges of a dark bar on a bright wall are told apart.
+the two edges of a dark bar on a bright wall are distinct.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.geometry import segment2
 
-#: Of segments that are detected unless the caller says so: shortest length, pixels, and smallest mean gradient across,
+#: Defaults of detected segments: shortest length, pixels, and smallest mean gradient across,
 #: grey levels (of 255) per pixel.
 MIN_LENGTH, MIN_STRENGTH = 20.0, 3.0
 
@@ -84,7 +84,7 @@ class Segments:
     ) -> Segments:  # fmt: skip
         """Segments cut off at the border of an image of a size (height, width), the longest first.
 
-        Those that are shorter or weaker than wanted are left out.
+        Shorter or weaker ones are left out.
         """
         ends = np.clip(ends, 0.0, np.array(size[::-1] * 2, np.float64))
         length = np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1])

@@ -2,7 +2,7 @@
 """OpenCV's SIFT in a bounded memory, in groma's pixel convention.
 
 SIFT begins with an image of twice the size and keeps all layers of it, 235 bytes for each pixel of the original. A
-large image is therefore looked at in two ways. What is found at the first two octaves, in the doubled image and in the
+large image is therefore processed in two ways. What is found at the first two octaves, in the doubled image and in the
 image itself, depends on its surroundings alone: it comes from tiles that overlap by as much, and is the same as from
 the whole. Larger scales come from the image at half its size, blurred as SIFT takes an image to be, and that one is
 looked at in the same manner. Its own doubled image is not used: interpolation adds a blur that finer scales show.
@@ -31,7 +31,7 @@ from groma._rows import Rows, column
 from groma._typing import FloatArray, IntArray
 from groma.features.images import GrayImage
 
-#: Pixels of an image that is looked at as a whole, and largest sides of the tiles of others (cost: memory and time).
+#: Maximum pixels of an image processed as a whole, and sides of the tiles of others (cost: memory and time).
 AT_ONCE, TILE = 2**21, 1216
 #: Pixels around a tile that what is found there depends on, and some more. Pixels of the doubled image: 34 by the
 #: filters up to the layer from which the second octave is made; there, twice 29 by those up to the last layer that is
@@ -59,7 +59,7 @@ class Blobs(Rows):
 
 
 def find_blobs(image: GrayImage, most: int, contrast: float) -> Blobs:
-    """Find and describe blobs of any scale and direction: those of the highest contrast, at most so many."""
+    """Find and describe blobs of any scale and direction, a limited number of those of highest contrast."""
     sift = cv2.SIFT_create(nfeatures=most, contrastThreshold=contrast, enable_precise_upscale=False)  # type: ignore[attr-defined]
     tiles = _Tiles.of(image)
     if tiles.count == 1:
@@ -99,7 +99,7 @@ def describe_upright(image: GrayImage, pixels: FloatArray, size: float) -> tuple
 
 @dataclass(frozen=True)
 class _Tiles:
-    """The parts in which an image is looked at, row by row."""
+    """The tiles of an image, row by row."""
 
     #: Rows and columns of tiles, and of the pixels of one.
     grid: tuple[int, int]
@@ -125,7 +125,7 @@ class _Tiles:
         return row * self.grid[1] + column_
 
     def shown(self, image: GrayImage, tile: int) -> tuple[GrayImage, FloatArray]:
-        """Return a tile with what is around it, and the pixel (2,) where that begins."""
+        """Return a tile with its margin, and the first pixel (2,) of it."""
         row, column_ = divmod(tile, self.grid[1])
         top, left = max(row * self.side[0] - _AROUND, 0), max(column_ * self.side[1] - _AROUND, 0)
         bottom, right = (row + 1) * self.side[0] + _AROUND, (column_ + 1) * self.side[1] + _AROUND
@@ -133,7 +133,7 @@ class _Tiles:
 
 
 def _moved(blobs: Blobs, shift: FloatArray) -> Blobs:
-    """Blobs of a part of an image that begins at a pixel."""
+    """Blobs of a part of an image with the given first pixel."""
     return replace(blobs, pixels=blobs.pixels + shift)
 
 

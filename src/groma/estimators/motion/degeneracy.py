@@ -9,7 +9,7 @@ from groma._typing import FloatArray
 from groma.estimators.motion.groups import Kind
 from groma.estimators.motion.matches import LandmarkMatches
 
-#: Offsets within so many standard deviations count as none (derived from normal noise: one in 16 000 is larger).
+#: Offsets within this many standard deviations count as zero (derived from normal noise: one in 16 000 is larger).
 _SIGMAS = 4.0
 
 

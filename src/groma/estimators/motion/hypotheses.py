@@ -2,7 +2,7 @@
 r"""Motions of a few matches, in closed form.
 
 *Rigid motions and similarities* of three matches. Two of their directions, of lines or from point to point, give the
-rotation; a line does not say which way it runs, so each sign is a proposal of its own. Scale and translation then solve
+rotation; lines have no sign, so each combination of signs is a proposal. Scale and translation then solve
 
 .. math:: N_i^\top (s\,R\,a_{ik} + t) = N_i^\top b_i \text{ (lines)}, \qquad s\,R\,a_i + t = b_i \text{ (points)}.
 
@@ -29,7 +29,7 @@ SAMPLE: dict[str, int] = {"rigid": 3, "similarity": 3, "projective": 5}
 
 @dataclass(frozen=True, eq=False)
 class _Equations:
-    """Matches as equations: what is moved, across what it is compared, and with what."""
+    """Matches as equations: moved objects, directions across which they are compared, and targets."""
 
     #: (n, 2, 3) ends in a, twice the same for points; (n, 2, 3, 3) rows of the comparison; (n, 3) places in b.
     moved: FloatArray

@@ -2,7 +2,7 @@
 r"""Matched lines and points, their noise, and their residuals under a motion.
 
 A line is known from a segment whose ends, :math:`a_0, a_1` and :math:`b_0, b_1`, have the standard deviation
-:math:`\sigma` across it; where it ends says nothing. A motion :math:`H` takes the ends of the first to
+:math:`\sigma` across it; its end points carry no information. A motion :math:`H` takes the ends of the first to
 :math:`y_0, y_1`, whose offsets across the second are the four numbers in which two lines differ,
 
 .. math:: r_k = N^\top (y_k - b_0), \quad

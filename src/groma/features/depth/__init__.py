@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a depth image says: its noise, the planes in it, and the depths of segments."""
+"""Depth images: their noise, planes in them, and depths of segments."""

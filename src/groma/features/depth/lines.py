@@ -73,7 +73,7 @@ class DepthLines:
 
     #: (N,) whether there is a line.
     good: BoolArray
-    #: (N,) what it was fitted to: ``NONE``, ``SURFACE``, ``CREASE``, or one side of the segment, ``LEFT``, ``RIGHT``.
+    #: (N,) the fitted part: ``NONE``, ``SURFACE``, ``CREASE``, or one side of the segment, ``LEFT``, ``RIGHT``.
     support: npt.NDArray[np.int8]
     #: (N, 2, 3) the points of the line at the ends of the segment, metres.
     end_points: FloatArray
@@ -137,7 +137,7 @@ def fit_depth_lines(
 
     Notes
     -----
-    A segment whose nearer side has no depth takes that of the farther one; nothing in one image tells.
+    A segment whose nearer side has no depth takes that of the farther one; one image cannot show the error.
     """
     segments = np.ascontiguousarray(ends, np.float64)
     if segments.ndim != 2 or segments.shape[1] != 4:

@@ -43,7 +43,7 @@ class PlaneSearchOptions:
     step: int = 2
     #: A plane covers at least this share of the image, blocks without depth not counted.
     min_share: float = 0.006
-    #: At most so many planes, the largest (cost: time).
+    #: Maximum number of planes, the largest (cost: time).
     max_planes: int = 16
     #: Largest mean squared whitened distance of a block from the plane that grows over it.
     gate: float = 3.0

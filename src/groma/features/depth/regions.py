@@ -18,7 +18,7 @@ from groma.gates import gate
 
 #: Regions that are remembered: the size of an array (cost: they fit in a byte).
 MAX_REGIONS = 120
-#: The normals of two regions are compared up to this angle, radians: beyond, noise tells nothing of them.
+#: The normals of two regions are compared up to this angle, radians; beyond, noise is no explanation.
 _ANY_ANGLE = 1.5
 
 
@@ -152,7 +152,7 @@ def _fit_blocks(sums, counts, gate, min_count, flat, thetas, quality, labels):
             chi = _chi_square(s, t) / max(counts[i, j] - 3, 1)
             if rho > flat * length and chi < gate:
                 labels[i, j] = -1
-                # Blocks with few pixels fit well by chance and say little: they are tried last.
+                # Blocks with few pixels fit well by chance: they are tried last.
                 quality[i * columns + j] = (chi + 1.0) / counts[i, j]
 
 

@@ -96,7 +96,7 @@ def _describe_all(gradient_u, gradient_v, ends, band_rows, step, max_samples, fa
         for r in range(num_rows):
             offset = (r - 0.5 * (num_rows - 1)) * step
             _row(gradient_u, gradient_v, u1 + offset * nu, v1 + offset * nv, du, dv, count, nu, nv, rows[r])
-            # Rows far from the segment say less: another surface may begin there.
+            # Rows far from the segment have less weight: they may be on another surface.
             far = 2.0 * offset / (num_rows * step)
             weight = math.exp(-0.5 * (far / fade) ** 2)
             for c in range(4):

@@ -38,7 +38,7 @@ class FlowOptions:
 
     #: Distance of the points along a segment, pixels.
     step: float = 3.0
-    #: A point must come back to within this distance, pixels.
+    #: Maximum forward-backward error, pixels.
     round_trip: float = 2.0
     #: A point votes for a segment within this distance, pixels.
     max_distance: float = 3.0

@@ -53,7 +53,7 @@ FEATURES = 6
 class WideBaselineOptions:
     """What counts as a match."""
 
-    #: Candidates further apart are not looked at.
+    #: Candidates farther apart are skipped.
     max_descriptor_distance: float = 0.9
     #: Smallest epipolar overlap, as a share of the smaller extent; only with a fundamental matrix.
     min_overlap: float = 0.3
@@ -124,7 +124,7 @@ def _points(ids_1, distance_1, low_1, high_1, ids_2, distance_2, low_2, high_2, 
         else:
             one, two = distance_1[i], distance_2[j]
             if abs(one) < on_line or abs(two) < on_line:
-                # On the line: the side says nothing, but a point close to both supports them.
+                # On the line: no side, but a point close to both supports them.
                 if abs(one) < 2.0 * on_line and abs(two) < 2.0 * on_line:
                     for_it += 1.0
                 else:
@@ -157,7 +157,7 @@ def _epipolar_line(F, u, v):
 def _overlaps(a, b, ends, j, min_overlap, tolerance, min_extent):
     """Return whether segment j can lie between two epipolar lines, and the shares of both segments that overlap.
 
-    Shares are -1 where the geometry does not tell.
+    Shares are -1 where the geometry does not determine them.
     """
     on_1 = -1.0
     on_2 = -1.0
