@@ -3,8 +3,8 @@ r"""Which features belong to a structure that is not exact: a mixture whose memb
 
 A plane of a building is no plane, and its joints are not quite parallel. How far its members are off, beyond their own
 noise, is not known in advance; it is estimated from the features, together with the share of them that are members.
-With the offset :math:`x` of a feature in the axes of its noise, variances :math:`s_a^2` there, and the unit of deviation
-:math:`\ell` at the feature, members of a structure with the deviation t have the density
+With the offset :math:`x` of a feature in the axes of its noise, variances :math:`s_a^2` there, and the unit of
+deviation :math:`\ell` at the feature, members of a structure with the deviation t have the density
 
 .. math:: g(x; t) = \prod_a N(x_a;\; 0,\; s_a^2 + t^2 \ell^2),
 

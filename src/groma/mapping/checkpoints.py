@@ -34,7 +34,7 @@ _KEY_LENGTH = 12
 def digest(*parts: object) -> str:
     """Return the hash of values: arrays by their content, dataclasses, mappings and sequences by theirs.
 
-    Of other objects it is what they say of themselves, else their class and what they hold.
+    Of other objects it is their repr, else their class and attributes.
     """
     state = hashlib.sha256()
     _feed(state.update, parts)
@@ -54,7 +54,7 @@ def _feed(update: Callable[[bytes], None], value: Any) -> None:
         update(f"[{len(value)}".encode())
         for item in value:
             _feed(update, item)
-    elif _is_plain(value):  # says but where it lies in memory
+    elif _is_plain(value):  # a repr with nothing but its address
         held = getattr(value, "__dict__", {})
         _feed(update, [_name(value), {name: _name(one) if _is_plain(one) else one for name, one in held.items()}])
     else:
@@ -79,7 +79,7 @@ def digest_files(folder: Path, files: list[Path]) -> str:
 class Stage(Generic[_Options, _Result]):
     """A function from values to a value, with a name under which its result is kept. Made by :func:`stage`.
 
-    The function takes values, options, and a progress to say: ``function(*values, options, say)``.
+    The function takes values, options, and a progress callback: ``function(*values, options, say)``.
     """
 
     name: str
@@ -112,7 +112,7 @@ class Stages(Generic[_Options]):
     options : object
         Given to every stage.
     say : callable, optional
-        Given to every stage: called with the name of what is done, how much is done and how much there is to do.
+        Passed to every stage: called with a name, the number of parts done, and their total.
 
     Raises
     ------
@@ -140,7 +140,7 @@ class Stages(Generic[_Options]):
             self._lock = None
 
     def place(self, name: str) -> Path:
-        """Return a folder of the present stage, for what it keeps while it works."""
+        """Return a folder of the current stage for its intermediate files."""
         folder = self.folder / f"{name}-{self._key[:_KEY_LENGTH]}"
         self._drop_others(name, folder)
         return folder
@@ -210,7 +210,7 @@ class Stages(Generic[_Options]):
         """Return what a file holds, or make it."""
         kind, name = stage.kind, path.stem[: -_KEY_LENGTH - 1]
         if path.exists():
-            # A file that cannot be read was damaged by somebody else: it is made again.
+            # An unreadable file was damaged from outside: it is made again.
             with suppress(FileFormatError):
                 return kind.read(path)
             path.unlink()
@@ -233,7 +233,7 @@ class Stages(Generic[_Options]):
 
 
 def system_reason(error: OSError) -> str:
-    """Return what the system said, without the place, of an error that may have been wrapped."""
+    """Return the message of the system, without the path, of an error that may have been wrapped."""
     while isinstance(error, OutputError) and isinstance(error.__cause__, OSError):
         error = error.__cause__
     return (error.strerror or str(error)).rstrip(".")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""One process at a time in a folder: the lock goes with the process, however it ends."""
+"""One process at a time in a folder: the lock is released when the process ends in any way."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ class LensGates:
 
 
 GATES = LensGates()
-#: Places looked at along a segment, to find the part of it inside the image (cost: time).
+#: Samples along a segment, to find the part of it inside the image (cost: time).
 _SAMPLES = 65
 
 
@@ -117,7 +117,7 @@ class Straightener:
     def _inside(self, pixels: FloatArray) -> npt.NDArray[np.bool_]:
         bent = self._bend(pixels)
         inside = np.all((bent >= 0.0) & (bent <= np.array(self.size)), axis=1)
-        # Far out a polynomial lens model folds the plane back into the image; only what comes back was seen there.
+        # Far out, polynomial lens models fold the plane back into the image; only pixels that map back to it count.
         back = self.model.undistort_pixels(self.params, bent[inside]) + self._shift
         inside[inside] = np.all(np.abs(back - pixels[inside]) < GATES.max_fold, axis=1)
         return inside

@@ -30,7 +30,7 @@ _START_OF_SCAN, _END_OF_IMAGE = b"\xff\xda", b"\xff\xd9"
 
 
 def image_files(folder: Path) -> list[Path]:
-    """Return the images in a folder and its sub-folders, sorted; hidden ones are not looked at, nor into."""
+    """Return the images in a folder and its sub-folders, sorted; hidden files and folders are skipped."""
     if not folder.is_dir():
         what = "is a file, not a folder of images" if folder.exists() else "is not a folder of images"
         video = folder.suffix.lower() in VIDEOS
@@ -79,7 +79,7 @@ def read_gray(path: Path) -> GrayImage:
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}. Check the file.") from error
     if content[:2] == b"\xff\xd8" and content.rfind(_END_OF_IMAGE) < content.rfind(_START_OF_SCAN):
-        # Decoders fill what is missing with grey. A preview inside the file has both marks, so the last ones count.
+        # Decoders fill missing parts with grey. An embedded preview has both markers, so the last ones count.
         raise InputError(f"{path} ends in the middle of the picture (JPEG without its end). Copy it again.")
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
@@ -100,7 +100,7 @@ def read_gray(path: Path) -> GrayImage:
 
 
 def check_names(folder: Path, names: Sequence[str], scene: Scene) -> None:
-    """Check that every image of a model is among the files; where only the folder differs, say which to pass."""
+    """Check that every image of a model is among the files; if only the folder differs, name the right one."""
     again = next((name for name, number in Counter(scene.images.names).items() if number > 1), None)
     if again is not None:
         raise InputError(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Which stages a map goes through, before it begins: the names that its progress will be called with, in order.
+"""The stages of a map before it starts: the names with which its progress will be called, in order.
 
 Stages whose results are kept from an earlier run are passed over, and the lines are mapped again, from ``adjusting
 points and lines`` on, while that moves the poses.
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     from groma.mapping.options import MapOptions
 
-#: What a map begins with: photographs alone, poses without points, or a model of both.
+#: Initial data of a map: photographs alone, poses without points, or a model of both.
 Start = Literal["photographs", "poses", "model"]
 _POINTS = ("finding points in images", "matching points of image pairs")
 _STARTS: dict[Start, tuple[str, ...]] = {
@@ -38,7 +38,7 @@ def planned_stages(
     options : MapOptions
         Of the map.
     start : str
-        What it begins with.
+        Initial data.
     surveyed : bool
         Positions, control points or distances take part.
     given_segments : bool

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Photographs that were read row by row, mapped as if they had been taken at once.
 
-Points tell how the cameras moved (:mod:`groma.adjustment.rolling_shutter`). What was seen of points and segments is
-then moved to where it would have been seen from the pose of the middle row: points by their own depth, the ends of
-segments by that of the points near them. The map is made of that, by stages that know of no rolling shutter. At the end
+Points determine how the cameras moved (:mod:`groma.adjustment.rolling_shutter`). What was seen of points and segments
+is then moved to where it would have been seen from the pose of the middle row: points by their own depth, the ends of
+segments by that of the points near them. The map is made of that, by stages without a rolling shutter. At the end
 points and segments return to where they were measured, and everything is adjusted once more with the motions.
 """
 
@@ -72,7 +72,7 @@ def check_read_rows(options: MapOptions) -> None:
 
 
 def read_by_rows(scene: Scene, options: MapOptions, depth: object = None) -> bool:
-    """Tell whether photographs were read row by row: it was said, or the scene knows. Refuse depths beside it."""
+    """Whether photographs have a rolling shutter, by option or by the scene. Refuse depths with it."""
     rolling = options.rolling_shutter is not None or len(scene.camera_motions) > 0
     if rolling and depth is not None:
         raise InputError("Depths do not support a rolling shutter. Leave --depth or --rolling-shutter out.")
@@ -130,7 +130,7 @@ def as_measured(scene: Scene, at_once: TakenAtOnce) -> Scene:
 
 
 def mapped_as_measured(result: MapResult, at_once: TakenAtOnce, stages: Stages[MapOptions]) -> MapResult:
-    """Return the map adjusted with what was measured, and what is to be said of the motions."""
+    """Return the map adjusted with the measured pixels, and the estimated motions."""
     if not len(at_once.points.camera_motions):
         asked = stages.options.rolling_shutter is not None
         return replace(result, warnings=(*result.warnings, NOT_ROLLING)) if asked else result
@@ -152,7 +152,7 @@ def mapped_as_measured(result: MapResult, at_once: TakenAtOnce, stages: Stages[M
     )
 
 
-# The map that it begins from has lost the lines that are probably wrong.
+# Its initial map lacks the lines that are probably wrong.
 @stage("as-measured", ADJUSTED, lambda options: options.min_confidence)
 def adjust_as_measured(
     scene: Scene, weighted: AdjustOptions, options: MapOptions, say: Callable[[str, int, int], None]
@@ -209,7 +209,7 @@ def _keys(*columns: Any) -> Any:
 
 
 def _find(wanted: Any, known: Any) -> IntArray:
-    """Return the row of ``known`` that equals each of ``wanted``."""
+    """Return the row of ``known`` equal to each of ``wanted``."""
     order = np.argsort(known)
     if not len(wanted):
         return np.zeros(0, np.int64)

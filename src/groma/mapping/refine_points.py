@@ -65,7 +65,7 @@ class PointRefinement:
     refined: BoolArray
     #: (N,) whether it defines its point; its place stays.
     reference: BoolArray
-    #: The usual standard deviation of a coordinate afterwards, pixels, as far as the images tell.
+    #: The median standard deviation of a coordinate afterwards, pixels, by the images.
     sigma_px: float
 
 
@@ -135,7 +135,7 @@ def refine_points(
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """What the observations of points are looked for with."""
+    """The data of the search for observations of points."""
 
     scene: Scene
     read: Callable[[int], GrayImage]

@@ -26,7 +26,7 @@ LENS_NOTE = f"The lens needs two coefficients of distortion ({WIDER_LENS}): one 
 
 
 def start_of(folder: Path, names: list[str], model: Scene | None, stages: Stages[MapOptions]) -> PlacedPhotographs:
-    """Return poses and points of photographs, from what is known about them.
+    """Return poses and points of photographs, from the given data.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def with_fitting_lens(scene: Scene, threads: int | None = None) -> Scene:
 
 
 def _is_unknown(options: MapOptions) -> bool:
-    """Whether nothing was said about the cameras."""
+    """Whether no option describes the cameras."""
     return options.camera_model is None and not options.point_model().is_calibrated
 
 

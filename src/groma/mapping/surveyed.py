@@ -51,7 +51,7 @@ class SurveyedResult:
     result: AdjustResult
     #: How the scene got into its frame, with the scene as it went in.
     surveyed: Surveyed
-    #: What the adjustment says of the measurements; None where the poses are not determined.
+    #: Tests of the measurements; None where the poses are not determined.
     reliability: Reliability | None
 
     def to_dict(self) -> dict[str, Any]:
@@ -60,7 +60,7 @@ class SurveyedResult:
 
 
 def survey_numbers(surveyed: Surveyed | None, found: Reliability | None, scene: Scene) -> dict[str, Any]:
-    """Return what a summary says of measurements, as plain values."""
+    """Return the entries of a summary about measurements, as plain values."""
     return (surveyed.to_dict() if surveyed else {}) | (found.to_dict() if found else {}) | given_poses_of(scene)
 
 

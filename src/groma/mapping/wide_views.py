@@ -42,9 +42,9 @@ class WideGates:
 
 
 GATES = WideGates()
-#: Places looked at along a segment, to find the part of it that belongs to a view (cost: time).
+#: Samples along a segment, to find the part of it that belongs to a view (cost: time).
 _SAMPLES = 65
-#: Places looked at along each side of an image (cost: time).
+#: Samples along each side of an image (cost: time).
 _GRID = 128
 #: Directions of the views, camera frame, and which way is right in them.
 _AXES = np.array([[0, 0, 1], [1, 0, 0], [0, 0, -1], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], float)
@@ -85,7 +85,7 @@ class WideViews:
         turns, pinhole, sizes = [], [], []
         for k in np.flatnonzero(np.bincount(side, minlength=len(_AXES)) >= GATES.min_share * len(rays)):
             turn = np.stack([_RIGHT[k], np.cross(_AXES[k], _RIGHT[k]), _AXES[k]])
-            # Coarse steps between the places looked at, and the part of the plane that they show.
+            # Coarse steps between samples, and the part of the plane that they cover.
             places = rays[side == k] @ turn.T
             shown = places[:, :2] / places[:, 2:]
             slack = (reach - 1.0) + 4.0 / _GRID
@@ -111,7 +111,7 @@ class WideViews:
         if not self.model.is_planar:  # its borders are places like any other
             inside = np.isfinite(pixels).all(axis=1)
         own &= inside
-        # Far out a polynomial lens model folds the sphere back into the image; only what comes back was seen there.
+        # Far out, polynomial lens models fold the sphere back into the image; only pixels that map back to it count.
         again = self.model.unproject(self.params, pixels[own])
         focal = self.pinhole[view, 0]
         own[own] = np.linalg.norm(again - unit(rays[own]), axis=1) * focal < GATES.max_fold
@@ -197,7 +197,7 @@ class WideDetection:
 
 
 def _rays(model: camera_models.CameraModel, params: FloatArray, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Rays of pixels, and whether the model has one that comes back to the pixel."""
+    """Rays of pixels, and whether they project back to the pixel."""
     rays = model.unproject(params, pixels)
     seen: BoolArray = np.asarray(np.isfinite(rays).all(axis=1), np.bool_)
     back = model.project(params, np.where(seen[:, None], rays, [0.0, 0.0, 1.0]))

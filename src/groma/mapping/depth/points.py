@@ -40,7 +40,7 @@ class MeasuredDepths:
     noise: DepthNoise
     #: Units of the scene that was given for one of this: 1 where it was known.
     scale: float
-    #: Whether every map has a unit of its own.
+    #: Whether every map has its own unit.
     relative: bool
     #: Correlations of errors in a cell of an image and across it.
     correlations: tuple[float, float]
@@ -86,7 +86,7 @@ def measure_depths(
     maps : DepthMaps
         The depth maps of its images.
     known : float, optional
-        Length in units of the model of one unit of the maps, where other measurements tell it.
+        Length in units of the model of one unit of the maps, if other measurements determine it.
     progress : callable, optional
         Called with the number of images done and in all.
 
@@ -150,7 +150,7 @@ def check_cameras(scene: Scene) -> None:
 
 
 def read_map(maps: DepthMaps, file: Path, size: tuple[int, int]) -> DepthMap:
-    """Read a depth map; refuse one that looks like millimetres."""
+    """Read a depth map; refuse one that is probably in millimetres."""
     depth = maps.read(file, size)
     if maps.holds_millimetres(depth, file):
         raise FileFormatError(

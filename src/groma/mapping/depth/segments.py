@@ -43,7 +43,7 @@ def segment_depths(
     segments : sequence of C Segments
         Of its images.
     maps, measured : DepthMaps, MeasuredDepths
-        The maps, and what points told of them.
+        The maps, with the estimates from points.
     progress : callable, optional
         Called with the number of images done and in all.
     """
@@ -87,7 +87,7 @@ def with_line_depths(scene: Scene, line_map: LineMap, segments: Sequence[Segment
     image, ends = line_map.image_idx[rows], scene.lines.segments[line_map.line_idx[rows]]
     q, sigma = of[rows, :2], np.sqrt(of[rows][:, [2, 4]])
     sigma = sigma * _misfit(q - _predicted(scene, image, scene.line_observations.segment[rows], ends), sigma)
-    # Far enough apart that what depth says is more than what the segment says already: a pixel of usual noise.
+    # Far enough apart that depth adds information to the segment: a pixel of usual noise.
     camera = scene.images.camera_idx[image]
     focal = np.array([
         np.mean(camera_models.model(name).focal_length(scene.cameras.params_of(row)[None]))

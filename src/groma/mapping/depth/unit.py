@@ -55,12 +55,12 @@ def common_unit(ratio: FloatArray, image_idx: IntArray, known: bool) -> tuple[fl
     image_idx : (N,) int64
         The image of each.
     known : bool
-        Whether other measurements tell the unit of the model; it is then 1.
+        Whether other measurements determine the unit of the model; it is then 1.
 
     Raises
     ------
     InputError
-        If too few points tell it, or other measurements say otherwise.
+        If there are too few points, or other measurements contradict them.
     """
     told = np.isfinite(ratio)
     if told.sum() < UNITS.min_points:
@@ -88,9 +88,9 @@ def common_unit(ratio: FloatArray, image_idx: IntArray, known: bool) -> tuple[fl
 def own_units(
     ratio: FloatArray, depth: FloatArray, image_idx: IntArray, names: Sequence[str]
 ) -> tuple[FloatArray, list[str]]:
-    """Return for each image (C,) what its depths are to be divided by, NaN where that is not known, and warnings.
+    """Return for each image (C,) the divisor of its depths, NaN where unknown, and warnings.
 
-    A map is left out where too few points tell, where ratios scatter, or where depths fall as those of points grow.
+    A map is left out if it has too few points, if ratios scatter, or if depths fall as those of points grow.
 
     Raises
     ------

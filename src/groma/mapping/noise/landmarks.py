@@ -41,7 +41,7 @@ class LandmarkNoiseGates:
 
 
 GATES = LandmarkNoiseGates()
-#: Observed segments that one piece of work goes through (cost: time only).
+#: Observed segments per task (cost: time only).
 _ROWS_AT_ONCE = 8192
 
 
@@ -152,7 +152,7 @@ def _line_squares(scene: Scene, ends: LineEndRows) -> tuple[FloatArray, IntArray
 
 @dataclass(frozen=True)
 class LineEndRows:
-    """Where the ends of observed segments lie on their lines, and how far across; NaN where one tells nothing."""
+    """Places of the ends of observed segments on their lines, and distances; NaN for uninformative ends."""
 
     #: (L, 2, 3) unit vectors across each line.
     across: FloatArray
@@ -165,7 +165,7 @@ class LineEndRows:
 
     @property
     def good(self) -> BoolArray:
-        """(N, 2) whether an end tells something."""
+        """(N, 2) whether an end is informative."""
         known = np.isfinite(self.residual) & np.isfinite(self.share) & np.isfinite(self.row).all(axis=2)
         return np.asarray(known, np.bool_)
 
@@ -278,7 +278,7 @@ def pixel_differences(scene: Scene, image_idx: IntArray, first: FloatArray, seco
 def _share_on_line(scene: Scene, image_idx: IntArray, measured: FloatArray, ends: FloatArray) -> FloatArray:
     """Where on the segments (0 first end, 1 second) the points closest to the rays of pixels lie."""
     share = shares_on_lines(scene, image_idx, measured, ends, min_squared_sine=1e-12)
-    # Rays nearly along the line say nothing; far points would only disturb.
+    # Rays nearly along the line are uninformative, and far points would only disturb.
     return np.where(np.abs(share - 0.5) < GATES.max_share, share, np.nan)
 
 
@@ -315,5 +315,5 @@ def _extent(scene: Scene) -> float:
 
 
 def _inverse(information: FloatArray, extent: float) -> FloatArray:
-    """Inverses of information matrices; what is not observed is uncertain by the extent of the scene."""
+    """Inverses of information matrices; unobserved directions are uncertain by the extent of the scene."""
     return np.asarray(np.linalg.inv(information + np.eye(information.shape[-1]) / extent**2), dtype=np.float64)

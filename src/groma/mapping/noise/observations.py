@@ -99,7 +99,7 @@ def line_end_correlation(scene: Scene) -> float:
 
 
 def line_bend(scene: Scene, end_correlation: float = 0.0) -> float:
-    r"""Return where a Cauchy loss of segments begins to bend, in the standard deviations that :func:`noise_px` returns.
+    r"""Return the scale of a Cauchy loss of segments, in the standard deviations that :func:`noise_px` returns.
 
     Two coordinates that follow Student's distribution with :math:`\nu` degrees of freedom and the variance parameter v
     have the squared norm q with
@@ -108,7 +108,7 @@ def line_bend(scene: Scene, end_correlation: float = 0.0) -> float:
               \qquad c^2 = \nu v,
 
     a Cauchy loss of the scale c. The median of q is :math:`c^2 (2^{2/\nu} - 1)`, so that with that of normal noise,
-    :math:`2 \log 2`, only :math:`\nu` is open; it follows by maximum likelihood. Infinite where too few segments tell.
+    :math:`2 \log 2`, only :math:`\nu` is open; it follows by maximum likelihood. Infinite with too few segments.
     """
     squares = (_line_residuals(scene, end_correlation) ** 2).sum(axis=1)
     usual = float(np.median(squares)) if len(squares) >= GATES.min_landmarks else 0.0
@@ -134,7 +134,7 @@ def _line_residuals(scene: Scene, end_correlation: float) -> FloatArray:
             continue  # measurements of other instruments
         told = images[factor.line.index] >= GATES.min_views  # type: ignore[attr-defined]
         residual, unit = residuals_of(factor, assembly.problem.variables), np.asarray(factor.sqrt_information)
-        # Where a camera sees behind itself, each end has a weight of its own.
+        # Where a camera sees behind itself, each end has its own weight.
         weighted = residual * unit[:, None] if unit.ndim == 1 else np.einsum("nij,nj->ni", unit, residual)
         ends.append(weighted[told])
     return np.concatenate(ends)

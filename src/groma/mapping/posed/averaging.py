@@ -114,7 +114,7 @@ def average_centers(given: FloatArray, rotations: FloatArray, motions: Motions, 
     least = 1e-3 * float(np.median(np.linalg.norm(given[first] - given[second], axis=1))) + 1e-12
 
     def averaged(start: FloatArray, loss: _Loss, sigma: float | None) -> Averaged:
-        # Lengths stay during a stage: else places far away, where every angle is small, would look right.
+        # Lengths are fixed during a stage: else places far away, where every angle is small, would fit.
         length = np.maximum(np.linalg.norm(start[first] - start[second], axis=1), least)
         # Images at one place would agree with any motion: no two come nearer than this, if their places are known.
         nearest = GATES.nearest * (length * (held[first] & held[second]))[:, None]
@@ -169,14 +169,14 @@ def _reweighted(
             continue
         redundancy = np.clip(1.0 - trust / used**2 * _inverse_diagonal(system, len(values)), 0.0, 1.0)
         counted = counts & (redundancy > GATES.least_redundancy)
-        if 2 * counted.sum() > counts.sum():  # else the given ones are too good for motions to tell their noise
+        if 2 * counted.sum() > counts.sum():  # else the given ones are too good for motions to show their noise
             squares = np.sum(own[counted] ** 2, axis=1) / redundancy[counted]
             noise = max(float(np.sqrt(np.median(squares) / chi_square_gate(0.5, 3))), 1e-9)
     return Averaged(values, own, noise, redundancy, kept)
 
 
 def _inverse_diagonal(system: SuperLU, count: int) -> FloatArray:
-    """Return the mean of the diagonal of the inverse over the coordinates of each of so many quantities."""
+    """Return the mean of the diagonal of the inverse over the coordinates of each of ``count`` quantities."""
     size = system.shape[0]
     parts = []
     for start in range(0, size, _COLUMNS):
@@ -192,7 +192,7 @@ def _huber(ratio: FloatArray) -> FloatArray:
 
 
 def _as_large(centers: FloatArray, given: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return centres in the size of the given ones: motions tell none, and wrong ones make everything smaller."""
+    """Return centres at the scale of the given ones: motions have none, and wrong ones shrink everything."""
     share = (weight / weight.sum())[:, None]
     middle, of_given = np.sum(share * centers, axis=0), np.sum(share * given, axis=0)
     around = centers - middle

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
 r"""Whether the axes of given poses are those that the photographs show.
 
-Motions between pairs of images know nothing of the poses. If all poses have cameras with axes turned by a matrix A of
-signs and exchanges, the rotation of a pair is :math:`A R A^\top`; if the poses go the other way, from the camera to the
-world, it is that of the inverses; if the places alone have exchanged or turned axes W, the directions between the
+Motions between pairs of images are independent of the poses. If all poses have cameras with axes turned by a matrix A
+of signs and exchanges, the rotation of a pair is :math:`A R A^\top`; if the poses go the other way, from the camera to
+the world, it is that of the inverses; if the places alone have exchanged or turned axes W, the directions between the
 centres are off by W and the rotations are not. Each such reading is scored by how far rotations and directions are off,
 cut at an angle from which a motion says no more than that it disagrees. The file is refused where another reading
 explains the motions by far better than its own; it is not turned.
 
-The camera's own turns cannot tell a mirrored world from turned axes: :math:`M R M = (-M) R (-M)` for a reflection M.
-The directions between the centres do.
+Rotations of the camera do not distinguish a mirrored world from turned axes: :math:`M R M = (-M) R (-M)` for a
+reflection M. The directions between the centres do.
 """
 
 from __future__ import annotations

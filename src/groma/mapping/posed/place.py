@@ -96,7 +96,7 @@ def place_photographs(
     images : Path
         Folder of the photographs.
     work : Path
-        Folder for features and matches; what is finished there is not done again.
+        Folder for features and matches; finished work in it is not repeated.
     given : Scene
         Cameras, names and poses. Every image is taken for itself, also where frames of rigs hold several.
     options : PointModelOptions
@@ -106,7 +106,7 @@ def place_photographs(
     refine_intrinsics : bool
         Estimate the calibration too.
     say : callable
-        Called with what is done, how much is done and how much there is to do.
+        Called with a name, the number of parts done, and their total.
 
     Raises
     ------
@@ -134,7 +134,7 @@ def place_photographs(
 
 
 def _told(found: Scene, known: GivenPoses | None, near: Similarity | None) -> PlacedPhotographs:
-    """Return the images that see points, in the frame of the given poses, with what there is to say."""
+    """Return the images that see points, in the frame of the given poses, with messages."""
     names, seen = found.images.names, _num_points_seen(found) >= MIN_MATCHES
     if seen.sum() < 2:
         raise InputError(
@@ -154,7 +154,7 @@ def _told(found: Scene, known: GivenPoses | None, near: Similarity | None) -> Pl
 
 
 def averaged(scene: Scene, motions: Motions) -> tuple[Scene, GivenPoses]:
-    """Return the scene with poses that agree with motions too, and what they tell about its own."""
+    """Return the scene with poses that agree with motions, too, and the noise of its own."""
     from groma.mapping.posed.averaging import average_centers, average_rotations  # sparse matrices are slow to import
 
     poses, centers = scene.cam_from_world, scene.cam_centers_in_world
@@ -169,7 +169,7 @@ def averaged(scene: Scene, motions: Motions) -> tuple[Scene, GivenPoses]:
 
 
 def _adjusted(scene: Scene, known: GivenPoses, refine_intrinsics: bool, last: bool) -> tuple[Scene, GivenPoses]:
-    """Return the scene adjusted with the given poses as measurements, and what is known about them then."""
+    """Return the scene adjusted with the given poses as measurements, and their estimated noise."""
     options = AdjustOptions(lines=False, planes=False, refine_intrinsics=refine_intrinsics, check_lens=False)
     if last:
         options = replace(options, point_sigma_px=noise_px(scene.replace(pose_priors=PosePriors()), "points"))
@@ -184,7 +184,7 @@ def _adjusted(scene: Scene, known: GivenPoses, refine_intrinsics: bool, last: bo
 
 
 def _compared(poses: FloatArray, covariance: FloatArray, known: GivenPoses) -> GivenPoses:
-    """Return what adjusted poses (N, 7) with their covariances (N, 6, 6) tell about the given ones."""
+    """Return the noise of the given poses, by adjusted ones (N, 7) with covariances (N, 6, 6)."""
     between = se3.log(se3.compose(poses, se3.inverse(known.poses)))
     told, sigma = [], []
     for part, before in zip((slice(0, 3), slice(3, 6)), known.sigma, strict=True):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Photographs with points, and what there is to say about how they got their poses."""
+"""Photographs with points, and messages about their poses."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What is said about poses from elsewhere: how good they are, which are wrong, and what was left out."""
+"""Messages about given poses: their noise, wrong ones, and images left out."""
 
 from __future__ import annotations
 
