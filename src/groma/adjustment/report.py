@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 from groma._counted import counted
@@ -30,6 +30,12 @@ class CreepingGates:
 
 #: The defaults.
 CREEPING = CreepingGates()
+#: Entries of the report of the solver that are part of this one.
+_OF_SOLVE = (
+    *("num_residuals", "num_unknowns", "initial_cost", "final_cost", "initial_costs", "final_costs"),
+    *("reduced_chi_square", "iterations", "converged", "linear_solver", "threads", "num_degenerate"),
+    "num_underdetermined_landmarks",
+)
 
 
 @dataclass(frozen=True)
@@ -100,37 +106,15 @@ class AdjustReport:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report as plain numbers and words, for JSON."""
-        solve = self.solve
-        return {
-            "num_images": self.num_images,
-            "num_points": self.num_points,
-            "num_lines": self.num_lines,
-            "num_planes": self.num_planes,
-            "num_observations": self.num_observations,
-            "num_measurements": self.num_measurements,
-            "num_residuals": solve.num_residuals,
-            "num_unknowns": solve.num_unknowns,
-            "initial_cost": solve.initial_cost,
-            "final_cost": solve.final_cost,
-            "initial_costs": solve.initial_costs,
-            "final_costs": solve.final_costs,
-            "reduced_chi_square": solve.reduced_chi_square,
-            "iterations": solve.iterations,
-            "termination": solve.termination.key,
-            "termination_sentence": solve.termination.sentence,
-            "converged": solve.converged,
-            "linear_solver": solve.linear_solver,
-            "threads": solve.threads,
-            "seconds": dict(solve.seconds),
-            "rmse_px": self.rmse_px,
-            "inliers": self.inliers,
-            "sigma0": self.sigma0,
-            "relations": self.relations,
+        own = {item.name: getattr(self, item.name) for item in fields(self) if item.name not in ("solve", "warnings")}
+        solve = {name: getattr(self.solve, name) for name in _OF_SOLVE}
+        return own | solve | {
+            "termination": self.termination.key,
+            "termination_sentence": self.termination.sentence,
+            "seconds": dict(self.solve.seconds),
             "stages": list(self.stages),
-            "num_degenerate": solve.num_degenerate,
-            "num_underdetermined_landmarks": solve.num_underdetermined_landmarks,
             "history": self.history,
-        }
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)

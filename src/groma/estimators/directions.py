@@ -228,8 +228,6 @@ def orthogonal_pairs(
     directions: FloatArray,
     covariance: FloatArray,
     sigma: float = DIRECTIONS.orthogonal_sigma,
-    level: float = DIRECTIONS.orthogonal_level,
-    max_sigma: float = DIRECTIONS.max_orthogonal_sigma,
 ) -> IntArray:
     r"""Pairs of directions that are orthogonal within their uncertainty.
 
@@ -243,10 +241,6 @@ def orthogonal_pairs(
         Their covariances.
     sigma : float
         How orthogonal things are that are meant to be, radians. Default 0.15 degrees.
-    level : float
-        Level of the test.
-    max_sigma : float
-        Pairs whose angle is less certain are left out, radians: passing the test would say nothing.
 
     Returns
     -------
@@ -258,8 +252,8 @@ def orthogonal_pairs(
     cosine = dot(directions[first], directions[second])
     variance = np.einsum("mi,mij,mj->m", directions[first], covariance[second], directions[first])
     variance += np.einsum("mi,mij,mj->m", directions[second], covariance[first], directions[second])
-    passed = cosine**2 < chi_square_gate(1.0 - level, 1) * (variance + sigma**2)
-    passed &= variance < max_sigma**2
+    passed = cosine**2 < chi_square_gate(1.0 - DIRECTIONS.orthogonal_level, 1) * (variance + sigma**2)
+    passed &= variance < DIRECTIONS.max_orthogonal_sigma**2
     return np.column_stack([first, second])[passed]
 
 

@@ -156,23 +156,16 @@ def _read_array(members: ArrayMembers, name: str, shape: tuple[int | None, ...])
     return members.read(name, check)
 
 
-def looks_like_archive(head: bytes) -> bool:
-    """Tell from the first bytes of a file whether it is a zip file, as archives are."""
-    return head[:4] in (b"PK\x03\x04", b"PK\x05\x06")
-
-
-def is_archive_name(path: str | os.PathLike[str]) -> bool:
-    """Tell from its name whether a file is meant to be an archive."""
-    return Path(path).suffix.lower() == ".npz"
-
-
 register_format(
     SceneFormat(
         "archive",
         source="a groma archive (.npz)",
         target=".npz for an archive",
         endings=(".npz",),
-        recognise=lambda place, head: looks_like_archive(head) or (is_archive_name(place) and place.is_file()),
+        # zip files, and damaged ones by name
+        recognise=lambda place, head: (
+            head[:4] in (b"PK\x03\x04", b"PK\x05\x06") or (place.suffix.lower() == ".npz" and place.is_file())
+        ),
         read=read_archive,
         write=write_archive,
     )

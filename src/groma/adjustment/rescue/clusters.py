@@ -82,7 +82,8 @@ def settle_clusters(scene: Scene, problem: Problem, threads: int | None = None) 
 
 def _clusters(ties: list[Factor], variables: Mapping[str, Variables]) -> tuple[dict[str, IntArray], int]:
     """Return the cluster of each line and of each point, -1 where nothing is tied to it, and how many there are."""
-    line, point = (np.concatenate([_indices(factor)[group] for factor in ties]) for group in ("lines", "points"))
+    indices = [{ref.group: ref.index for _, ref in factor.references()} for factor in ties]
+    line, point = (np.concatenate([index[group] for index in indices]) for group in ("lines", "points"))
     num_lines, size = len(variables["lines"]), len(variables["lines"]) + len(variables["points"])
     ends = line, num_lines + point
     label = connected_parts(*ends, size)
@@ -92,10 +93,6 @@ def _clusters(ties: list[Factor], variables: Mapping[str, Variables]) -> tuple[d
     used[label[tied]] = True
     label = np.where(tied, (np.cumsum(used) - 1)[label], -1)
     return {"lines": label[:num_lines], "points": label[num_lines:]}, int(used.sum())
-
-
-def _indices(factor: Factor) -> dict[str, IntArray]:
-    return {ref.group: ref.index for _, ref in factor.references()}
 
 
 def _label_of(factor: Factor, cluster: dict[str, IntArray]) -> IntArray:

@@ -81,7 +81,7 @@ def align(scene: Scene, reference: Scene | Survey) -> Alignment:
     if isinstance(reference, Survey):
         return _to_survey(scene, reference)
     rows = rows_by_name(scene.images.names, reference.images.names)
-    require_some(rows, scene.images.names, reference.images.names, "the scene", "an image")
+    require_some(rows, scene.images.names, reference.images.names, "the scene")
     mine = np.flatnonzero(rows >= 0)
     names = tuple(scene.images.names[row] for row in mine)
     source, target = scene.cam_from_world[mine], reference.cam_from_world[rows[mine]]

@@ -16,7 +16,7 @@ def nearest(name: str, known: Sequence[str]) -> str:
     return f" (nearest: {close[0]})" if close else ""
 
 
-def require_some(found: IntArray, wanted: Sequence[str], known: Sequence[str], source: str, kind: str) -> None:
+def require_some(found: IntArray, wanted: Sequence[str], known: Sequence[str], source: str) -> None:
     """Raise if no name was found.
 
     Raises
@@ -27,6 +27,6 @@ def require_some(found: IntArray, wanted: Sequence[str], known: Sequence[str], s
     if len(wanted) and not (found >= 0).any():
         example = nearest(wanted[0], known) or f" (such as {known[0]})" if len(known) else ""
         raise InputError(
-            f"{source}: none of its {len(wanted)} names is {kind} of the scene; the first is {wanted[0]!r}{example}. "
+            f"{source}: none of its {len(wanted)} names is an image of the scene; the first is {wanted[0]!r}{example}. "
             "Use the same names."
         )

@@ -64,7 +64,7 @@ class RobustSimilarity:
 _LARGEST = 1e60
 
 
-def robust_similarity(source: FloatArray, target: FloatArray, seed: int = 0) -> RobustSimilarity:
+def robust_similarity(source: FloatArray, target: FloatArray) -> RobustSimilarity:
     """Return the similarity that most of at least three correspondences (N, 3) agree on.
 
     Raises
@@ -76,10 +76,10 @@ def robust_similarity(source: FloatArray, target: FloatArray, seed: int = 0) -> 
         raise InputError(f"A similarity needs three places that are known in both frames; there are {len(source)}.")
     if (largest := max(np.abs(source).max(), np.abs(target).max())) > _LARGEST:
         raise InputError(f"Measured places or camera centres lie as far out as {largest:.3g}. Check the file.")
-    found = _fitted(source, target, seed)
+    found = _fitted(source, target)
     if len(source) > 3:
         mirror = np.array([-1.0, 1.0, 1.0])
-        mirrored = _fitted(source * mirror, target, seed)
+        mirrored = _fitted(source * mirror, target)
         if mirrored.inliers.sum() >= found.inliers.sum() and mirrored.scatter * GATES.mirrored < found.scatter:
             raise InputError(
                 f"The measured places fit a mirror image of the scene ({mirrored.scatter:.3g} instead of "
@@ -89,10 +89,10 @@ def robust_similarity(source: FloatArray, target: FloatArray, seed: int = 0) -> 
     return found
 
 
-def _fitted(source: FloatArray, target: FloatArray, seed: int) -> RobustSimilarity:
+def _fitted(source: FloatArray, target: FloatArray) -> RobustSimilarity:
     x, y = source - source.mean(0), target - target.mean(0)
     best, least = None, np.inf
-    for rows in _triples(len(x), seed):
+    for rows in _triples(len(x)):
         candidate = _of(x[rows], y[rows])
         if candidate is None:
             continue
@@ -127,10 +127,10 @@ def _fitted(source: FloatArray, target: FloatArray, seed: int) -> RobustSimilari
     return RobustSimilarity(whole, y - best.points(x), inliers, float(scatter), on_line)
 
 
-def _triples(count: int, seed: int):
+def _triples(count: int):
     if comb(count, 3) <= GATES.draws:
         return [np.array(rows) for rows in combinations(range(count), 3)]
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     return [random.choice(count, 3, replace=False) for _ in range(GATES.draws)]
 
 

@@ -27,9 +27,9 @@ def position_table(scene: Scene, survey: Survey, xyz: FloatArray, notes: list[st
     given = survey.positions
     assert given is not None
     rows = rows_by_name(given.names, scene.images.names)
-    require_some(rows, given.names, scene.images.names, given.source, "an image")
+    require_some(rows, given.names, scene.images.names, given.source)
     notes += tell_partly(rows, given.names, scene.images.names, given.source)
-    tell_unknown(given, rows, scene.images.names, "images that are not in the scene", notes)
+    tell_unknown(given, rows, scene.images.names, notes)
     known = np.flatnonzero(np.asarray(rows) >= 0)
     sigma = sigma_of(given, survey.position_sigma, "--position-sigma")
     if (twice := len(known) - len(np.unique(rows[known]))) > 0:
@@ -49,7 +49,7 @@ def control_tables(
             f"{', '.join(places.names[:_LISTED])}."
         )
     image = rows_by_name(given.image_names, scene.images.names)
-    require_some(image, given.image_names, scene.images.names, places.source, "an image")
+    require_some(image, given.image_names, scene.images.names, places.source)
     notes += tell_partly(image, given.image_names, scene.images.names, places.source)
     if missing := len(set(np.asarray(given.image_names)[image < 0].tolist())):
         notes.append(
@@ -110,14 +110,17 @@ def sigma_of(given: Places, stated: tuple[float, ...], option: str, needed: Any 
     return sigma
 
 
-def tell_unknown(given: Places, rows: IntArray, known: Sequence[str], words: str, notes: list[str]) -> None:
+def tell_unknown(given: Places, rows: IntArray, known: Sequence[str], notes: list[str]) -> None:
     """Add a note on unknown names of a file, with the most similar image without a measurement."""
     unknown = [given.names[row] for row in np.flatnonzero(rows < 0)]
     if unknown:
         named = set(rows.tolist())
         free = [name for row, name in enumerate(known) if row not in named]
         told = [name + nearest(name, free) for name in unknown[:_LISTED]] + unknown[_LISTED:]
-        notes.append(f"{given.source}: {counted(len(unknown), 'positions')} of {words}: {first_of(told, _LISTED)}.")
+        notes.append(
+            f"{given.source}: {counted(len(unknown), 'positions')} of images that are not in the scene: "
+            f"{first_of(told, _LISTED)}."
+        )
 
 
 def listed(names: Sequence[str], kind: str) -> str:

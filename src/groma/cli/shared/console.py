@@ -54,8 +54,8 @@ class Console:
         if not self.quiet:
             warn(text)
 
-    def warn_of_all(self, texts: Sequence[str], most: int = 3) -> None:
-        """Print warnings; of more than ``most`` that differ in numbers only, the first and the count of the others.
+    def warn_of_all(self, texts: Sequence[str]) -> None:
+        """Print warnings; of more than three that differ in numbers only, the first and the count of the others.
 
         The machine-readable report has all of them.
         """
@@ -63,7 +63,7 @@ class Console:
         for text in texts:
             alike.setdefault(re.sub(r"\d+", "0", text), []).append(text)
         for first, *others in alike.values():
-            if len(others) < most:
+            if len(others) < 3:
                 for text in (first, *others):
                     self.warn(text)
             else:

@@ -100,10 +100,7 @@ class PosedPhotographs:
                 matches = geometry.inlier_matches
                 if len(matches) < MIN_MATCHES or first not in row_of or second not in row_of:
                     continue
-                of = [
-                    cameras[int(self.scene.cameras.ids[self.scene.images.camera_idx[row_of[k]]])]
-                    for k in (first, second)
-                ]
+                of = [cameras[self._camera_id(row_of[k])] for k in (first, second)]
                 if not pycolmap.estimate_two_view_geometry_pose(of[0], places[first], of[1], places[second], geometry):
                     continue
                 motion = geometry.cam2_from_cam1

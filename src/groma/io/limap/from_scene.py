@@ -75,10 +75,6 @@ def _check_ids(scene: Scene) -> None:
             raise InputError(f"LIMAP files hold identifiers of {name} from 0 to {limit}. Renumber them.")
 
 
-def _num_points(scene: Scene) -> IntArray:
-    return np.diff(numbered_keypoints(scene)[1])
-
-
 def _images_2d(scene: Scene, like: Structures) -> tuple[list[Structure2d], IntArray]:
     """Return the images with their 2D lines, and the number of each line observation within its image."""
     seen = scene.line_observations
@@ -87,9 +83,8 @@ def _images_2d(scene: Scene, like: Structures) -> tuple[list[Structure2d], IntAr
     ends = np.searchsorted(seen.image_idx[order], np.arange(scene.num_images + 1)).tolist()
     line_number = np.zeros(len(seen), np.int64)
     images = []
-    for row, (number, num_points) in enumerate(
-        zip(scene.images.ids.tolist(), _num_points(scene).tolist(), strict=True)
-    ):
+    counts = np.diff(numbered_keypoints(scene)[1]).tolist()
+    for row, (number, num_points) in enumerate(zip(scene.images.ids.tolist(), counts, strict=True)):
         mine = order[ends[row] : ends[row + 1]]
         old = before.get(number, Structure2d(number))
         free: dict[bytes, list[int]] = {}

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Generator, Iterator
+from itertools import repeat
 from pathlib import Path
 
 import cv2
@@ -94,7 +95,7 @@ class VideoSequence:
         source = self._raw()
         try:
             # The other thread pulls; here we only wait, so the decoder is used by one thread at a time.
-            for frame in read_ahead(lambda _: self._next(source), _forever()):
+            for frame in read_ahead(lambda _: self._next(source), repeat(None)):
                 if frame is None:
                     break
                 yield frame
@@ -128,11 +129,6 @@ class VideoSequence:
                 number += 1
         finally:
             capture.release()
-
-
-def _forever() -> Iterator[None]:
-    while True:
-        yield None
 
 
 def times_of(folder: Path, images: list[Path]) -> list[float]:

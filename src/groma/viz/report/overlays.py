@@ -14,6 +14,8 @@ from groma.viz.statistics import LineStatistics
 
 #: Places along a segment where its image is computed under models with distortion.
 _SAMPLES = 17
+#: Width of a crop in the page, pixels.
+_CROP = 300
 
 
 def residual_top(numbers: LineStatistics) -> float:
@@ -57,7 +59,7 @@ def projected_places(scene: Scene, image_idx: int, line_idx: IntArray) -> tuple[
 
 
 def observation_crop(
-    picture: Picture, size: tuple[float, float], segment: FloatArray, ways: FloatArray, colour: str, width: int = 300
+    picture: Picture, size: tuple[float, float], segment: FloatArray, ways: FloatArray, colour: str
 ) -> str:
     """Return an inline SVG of the surroundings of one observed segment, with the image of its 3D line.
 
@@ -73,8 +75,6 @@ def observation_crop(
         Ways from the ends to the image of the line, pixels.
     colour : str
         Colour of the measured segment.
-    width : int
-        Width of the photograph in the page, pixels.
     """
     full = np.array([size[0] or picture.shape[1], size[1] or picture.shape[0]], float)
     ends = segment.reshape(2, 2)
@@ -87,7 +87,7 @@ def observation_crop(
     piece = picture[low[1] : high[1], low[0] : high[0]]
     if piece.size == 0:
         return ""
-    step = max(1, piece.shape[1] // (2 * width))
+    step = max(1, piece.shape[1] // (2 * _CROP))
     (left, top), (wide, tall) = low / scale, (high - low) / scale
     lines = [
         f'<path d="M{x1:.1f} {y1:.1f} {x2:.1f} {y2:.1f}" stroke="{stroke}" stroke-width="{thick}" fill="none" '

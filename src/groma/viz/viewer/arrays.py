@@ -1,13 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Arrays as the page of the viewer expects them."""
+"""Nodes that the pages of scenes and of running tracks share, and arrays as the page expects them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
-from groma._typing import FloatArray
+from groma._typing import FloatArray, IntArray
+from groma.scene.patches import PALETTE, patch_groups, triangle_fans
 from groma.viz.colours import Colours
 from groma.viz.viewer.content import REACH
+
+if TYPE_CHECKING:
+    import viser
 
 
 def by_end(colours: Colours) -> Colours:
@@ -33,3 +40,29 @@ def camera_scale(centers: FloatArray) -> float:
 
     gap = float(np.median(KDTree(centers).query(centers, k=2)[0][:, 1]))
     return float(np.clip(0.45 * gap, 0.02 * REACH, 0.12 * REACH))
+
+
+def add_segments(
+    server: viser.ViserServer, name: str, segments: FloatArray, colours: Colours, width: float, visible: bool = True
+) -> Any:
+    """Add segments (L, 2, 3) with colours (L, 3) or (3,), as wide on the screen as given."""
+    ends = by_end(np.broadcast_to(colours, (len(segments), 3)))
+    return server.scene.add_line_segments(
+        name, segments.astype(np.float32), ends, thickness=width, thickness_units="screen", visible=visible
+    )
+
+
+def add_patches(
+    server: viser.ViserServer, name: str, patches: Sequence[FloatArray], members: IntArray, visible: bool = True
+) -> list[Any]:
+    """Add polygons, those of one colour as one object: hundreds of planes are then drawn quickly."""
+    group, nodes = patch_groups(members) if patches else np.zeros(0, np.int64), []
+    for colour in np.unique(group):
+        vertices, faces = triangle_fans([patches[plane] for plane in np.flatnonzero(group == colour)])
+        red, green, blue = (int(channel) for channel in PALETTE[colour])
+        nodes.append(server.scene.add_mesh_simple(
+            f"{name}/{colour}", vertices.astype(np.float32), faces.astype(np.uint32),
+            color=(red, green, blue), opacity=0.28, side="double", flat_shading=True,
+            cast_shadow=False, receive_shadow=False, visible=visible,
+        ))  # fmt: skip
+    return nodes

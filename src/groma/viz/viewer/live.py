@@ -24,8 +24,7 @@ from groma.geometry import quaternion, se3
 from groma.io import read_scene
 from groma.io.reading import reading
 from groma.io.trajectories import read_tum
-from groma.scene.patches import patch_groups, plane_patches, triangle_fans
-from groma.viz import colours as _colours
+from groma.scene.patches import plane_patches
 from groma.viz.pack import thin
 from groma.viz.viewer import arrays as _view_arrays
 from groma.viz.viewer.glance import Picture, Statuses, read_now, read_statuses, timeline
@@ -41,7 +40,8 @@ EVERY = 0.5
 #: Seconds without a change after which a track is reported as quiet.
 QUIET = 20.0
 WAITING, RUNNING, FINISHED = "waiting", "running", "finished"
-_PATH, _NOW, _KEYFRAMES, _POINTS, _LINES = (40, 110, 220), (230, 60, 40), (120, 126, 134), (96, 104, 116), (20, 130, 90)
+_NOW, _KEYFRAMES, _POINTS = (230, 60, 40), (120, 126, 134), (96, 104, 116)
+_PATH, _LINES = np.array([40, 110, 220], np.uint8), np.array([20, 130, 90], np.uint8)
 _MAX_CAMERAS = 200
 #: What can be switched off.
 _SWITCHES = ("path", "keyframes", "points", "lines", "planes")
@@ -158,8 +158,9 @@ class LiveView:
             self.frame_shown.value = self.frame_shown.max
         centers = world_from_cam[:, 4:]
         if len(centers) > 1:
-            pieces = np.stack([centers[:-1], centers[1:]], axis=1).astype(np.float32)
-            self._nodes["path"] = [self._segments("/path", pieces, _PATH, 3.0, self.shown["path"].value)]
+            pieces = np.stack([centers[:-1], centers[1:]], axis=1)
+            visible = self.shown["path"].value
+            self._nodes["path"] = [_view_arrays.add_segments(self.server, "/path", pieces, _PATH, 3.0, visible)]
         self._draw_now()
 
     def _draw_now(self) -> None:
@@ -190,40 +191,23 @@ class LiveView:
                 point_size=0.004 * self._size, point_shape="circle", precision="float32",
                 visible=shown["points"],
             )]  # fmt: skip
-            segments = scene.lines.segments.astype(np.float32)
             self.server.scene.remove_by_name("/lines")
-            nodes["lines"] = [self._segments("/lines", segments, _LINES, 2.0, shown["lines"])] if len(segments) else []
+            nodes["lines"] = []
+            if scene.num_lines:
+                lines = _view_arrays.add_segments(
+                    self.server, "/lines", scene.lines.segments, _LINES, 2.0, shown["lines"]
+                )
+                nodes["lines"].append(lines)
             self.server.scene.remove_by_name("/keyframes")
             nodes["keyframes"] = [
                 self._camera(f"/keyframes/{row}", world[row], _KEYFRAMES, 1.0, shown["keyframes"])
                 for row in thin(len(world), _MAX_CAMERAS)
             ]
-            self._draw_planes(scene)
+            self.server.scene.remove_by_name("/planes")
+            nodes["planes"] = _view_arrays.add_patches(self.server, "/planes", *plane_patches(scene), shown["planes"])
         if not self._placed:
             self._placed = True
             self._look_at(0.5 * (low + high))
-
-    def _draw_planes(self, scene: Scene) -> None:
-        self.server.scene.remove_by_name("/planes")
-        self._nodes["planes"] = []
-        patches, members = plane_patches(scene)
-        group = patch_groups(members) if patches else np.zeros(0, np.int64)
-        for colour in np.unique(group):
-            vertices, faces = triangle_fans([patches[plane] for plane in np.flatnonzero(group == colour)])
-            red, green, blue = (int(channel) for channel in _colours.PALETTE[colour])
-            self._nodes["planes"].append(self.server.scene.add_mesh_simple(
-                f"/planes/{colour}", vertices.astype(np.float32), faces.astype(np.uint32),
-                color=(red, green, blue), opacity=0.28, side="double", flat_shading=True,
-                cast_shadow=False, receive_shadow=False, visible=self.shown["planes"].value,
-            ))  # fmt: skip
-
-    def _segments(
-        self, name: str, pieces: np.ndarray, colour: tuple[int, int, int], width: float, visible: bool
-    ) -> viser.LineSegmentsHandle:
-        ends = _view_arrays.by_end(np.tile(np.array(colour, np.uint8), (len(pieces), 1)))
-        return self.server.scene.add_line_segments(
-            name, pieces, ends, thickness=width, thickness_units="screen", visible=visible
-        )
 
     def _camera(
         self, name: str, world_from_cam: FloatArray, colour: tuple[int, int, int], size: float, visible: bool = True
@@ -277,9 +261,9 @@ def read_frames(path: Path) -> FloatArray:
 
 
 @contextlib.contextmanager
-def following(output: Path, port: int = 8080, host: str = "127.0.0.1", say: Say | None = None) -> Iterator[LiveView]:
+def following(output: Path, port: int = 8080, say: Say | None = None) -> Iterator[LiveView]:
     """Serve a running track inside a ``with`` block; call :meth:`LiveView.refresh` now and then."""
-    server = start_server(host, port, say)
+    server = start_server("127.0.0.1", port, say)
     try:
         yield LiveView(server, output)
     finally:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from groma._typing import BoolArray
-from groma.scene.patches import patch_groups, triangle_fans
+from groma.scene.patches import patch_groups
 from groma.viz import colours as _colours
 from groma.viz.pack import thin
 from groma.viz.pictures import ImageFiles, image_file, read_picture, warn_of_names_outside
@@ -182,13 +182,9 @@ class SceneView:
             kept, line = self.lines_shown(), self.content.segment_line
             drawn = kept[line]
             self.legend.content = _view_words.legend(found.low, found.high, found.meaning, int(kept.sum()), len(kept))
-            self.lines = self.server.scene.add_line_segments(
-                "/lines",
-                self.content.segments[drawn].astype(np.float32),
-                _view_arrays.by_end(found.colours[line[drawn]]),
-                thickness=self.line_width.value,
-                thickness_units="screen",
-                visible=self.shown["lines"].value,
+            segments, colours = self.content.segments[drawn], found.colours[line[drawn]]
+            self.lines = _view_arrays.add_segments(
+                self.server, "/lines", segments, colours, self.line_width.value, self.shown["lines"].value
             )
 
     def lines_shown(self) -> BoolArray:
@@ -233,36 +229,18 @@ class SceneView:
                 node.scale = self._camera_scale * self.camera_size.value
 
     def _add_planes(self) -> None:
-        """Draw planes of one colour as one object, which is fast for hundreds of planes."""
+        """Draw the planes, filled and with their edges."""
         patches = self.content.patches
         if not patches:
             return
-        group = patch_groups(self.content.patch_members)
-        for colour in np.unique(group):
-            vertices, faces = triangle_fans([patches[plane] for plane in np.flatnonzero(group == colour)])
-            red, green, blue = (int(channel) for channel in _colours.PALETTE[colour])
-            self._nodes["planes"].append(
-                self.server.scene.add_mesh_simple(
-                    f"/planes/faces/{colour}",
-                    vertices.astype(np.float32),
-                    faces.astype(np.uint32),
-                    color=(red, green, blue),
-                    opacity=0.28,
-                    side="double",
-                    flat_shading=True,
-                    cast_shadow=False,
-                    receive_shadow=False,
-                )
-            )
+        self._nodes["planes"] += _view_arrays.add_patches(
+            self.server, "/planes/faces", patches, self.content.patch_members
+        )
         edges = [np.stack([corners, np.roll(corners, -1, axis=0)], axis=1) for corners in patches]
+        colours = _colours.PALETTE[patch_groups(self.content.patch_members)]
+        colours = np.repeat(colours, [len(edge) for edge in edges], axis=0)
         self._nodes["planes"].append(
-            self.server.scene.add_line_segments(
-                "/planes/edges",
-                np.concatenate(edges).astype(np.float32),
-                _view_arrays.by_end(np.repeat(_colours.PALETTE[group], [len(edge) for edge in edges], axis=0)),
-                thickness=1.5,
-                thickness_units="screen",
-            )
+            _view_arrays.add_segments(self.server, "/planes/edges", np.concatenate(edges), colours, 1.5)
         )
 
     def _add_directions(self) -> None:
@@ -274,14 +252,7 @@ class SceneView:
         bars = np.stack([-vectors, vectors], axis=1) * length[:, None, None]
         colours = _colours.of_group(np.arange(len(vectors)))
         self._nodes["directions"].append(
-            self.server.scene.add_line_segments(
-                "/directions",
-                bars.astype(np.float32),
-                _view_arrays.by_end(colours),
-                thickness=5.0,
-                thickness_units="screen",
-                visible=False,
-            )
+            _view_arrays.add_segments(self.server, "/directions", bars, colours, 5.0, visible=False)
         )
 
     def _add_junctions(self) -> None:

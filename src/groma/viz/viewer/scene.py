@@ -68,14 +68,10 @@ def open_viewer(
 
 @contextlib.contextmanager
 def serving(
-    scene: Scene,
-    images: ImageFiles | None = None,
-    port: int = 8080,
-    host: str = "127.0.0.1",
-    say: Say | None = None,
+    scene: Scene, images: ImageFiles | None = None, port: int = 8080, say: Say | None = None
 ) -> Iterator[SceneView]:
     """Serve a scene inside a ``with`` block; parameters are those of :func:`open_viewer`."""
-    view = open_viewer(scene, images, port, host, say)
+    view = open_viewer(scene, images, port, say=say)
     try:
         yield view
     finally:
