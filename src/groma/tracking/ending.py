@@ -32,9 +32,9 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Adjusted:
-    """What became of a map at the end."""
+    """The final adjustment of a map."""
 
-    #: Of the last adjustment of all keyframes, if there was one.
+    #: Report of the last adjustment of all keyframes, if any.
     report: SolveReport | None
     right_turn: RightTurn
     #: None if planes were not searched in points and lines.
@@ -52,18 +52,18 @@ class Adjusted:
 
 
 class Ending:
-    """The steps at the end of a track, and what became of them."""
+    """The steps at the end of a track, and warnings about those that failed."""
 
     def __init__(self, mapper: Mapper, history: History) -> None:
         self._mapper, self._history = mapper, history
         self._interrupted = False
-        #: What was left out, for the reader.
+        #: Steps that were left out.
         self.warnings: list[str] = []
 
     def attempt(self, what: str, step: Callable[[], T], otherwise: T, changes: Sequence[int] | None = None) -> T:
-        """Return what a step gives; where it fails, the maps are as before and ``otherwise`` is returned.
+        """Return the result of a step; if it fails, restore the maps and return ``otherwise``.
 
-        ``changes`` are the numbers of the maps that the step may change, which are copied before it; None means all.
+        ``changes`` are the numbers of the maps that the step may change, which are copied before it; None: all.
         """
         if self._interrupted:
             return otherwise
@@ -82,7 +82,7 @@ class Ending:
         return otherwise
 
     def settle(self, present: Present) -> None:
-        """Make the keyframe that was chosen last, take up what threads worked out, and end them."""
+        """Make the last chosen keyframe, apply the results of threads, and end them."""
         mapper = self._mapper
         if mapper.due is not None:
             self.attempt("the last keyframe", lambda: mapper.make_keyframe(present, Stopwatch()), None)
@@ -90,7 +90,7 @@ class Ending:
         self._built("the end of the threads", mapper.close, None)
 
     def join(self) -> tuple[tuple[int, int], ...]:
-        """Join maps that saw the same place; return for each the map that holds it, and the shift of its keyframes."""
+        """Merge submaps of the same place; return for each the map that holds it, and the offset of its keyframes."""
         mapper = self._mapper
         places = Places.apart(mapper.maps)
         for joint in mapper.joints.values():
@@ -104,7 +104,7 @@ class Ending:
         return places.where
 
     def _searched(self, places: Places, one: int, two: int) -> Places:
-        """Look for places that two maps have in common."""
+        """Search for places common to two maps."""
         mapper = self._mapper
         joint = self.attempt(
             f"the search for places common to maps {one + 1} and {two + 1}",
@@ -119,7 +119,7 @@ class Ending:
         return self.attempt(what, lambda: places.joined(joint), places, changes=())
 
     def adjust(self, number: int) -> Adjusted:
-        """Adjust all keyframes of a map together, and with planes that are found in its points and lines."""
+        """Adjust all keyframes of a map together, then with planes found in its points and lines."""
         mapper, turn = self._mapper, self._mapper.right.turn
         if mapper.options.close_loops and not mapper.metric:
             self.attempt("the loops of one camera", lambda: mapper.close_scaled_loops(number), None, changes=(number,))
@@ -149,7 +149,7 @@ class Ending:
         return Submap(trajectory, scene, stamps[: scene.num_images])
 
     def _built(self, what: str, step: Callable[[], T], otherwise: T) -> T:
-        """Return what a step gives that is needed after an interruption too."""
+        """Return the result of a step that is needed even after an interruption."""
         try:
             return step()
         except (KeyboardInterrupt, Exception) as error:

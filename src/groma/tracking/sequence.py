@@ -60,19 +60,19 @@ _Told = Callable[[TrackProgress], bool | None]
 class SequenceResult(TrackResult):
     """Outcome of :func:`track`: that of the tracker, with properties of the sequence."""
 
-    #: What became of each frame, in order.
+    #: All frames in order, with their statuses.
     frames: tuple[TrackedFrame, ...] = ()
     #: Name of the sequence, and the kind of its frames: ``rgbd``, ``stereo`` or ``mono``.
     name: str = ""
     kind: str = ""
-    #: Whether it was ended early.
+    #: Whether the track was ended early.
     interrupted: bool = False
     #: Comparison with the reference of the sequence, if it has one; else why there is none.
     scores: TrajectoryScores | None = None
     not_compared: str = ""
-    #: The map that was tracked in, if there was one: where it is, its keyframes, when the first frame was found in it.
+    #: The saved map, if any: its path, number of keyframes, and the time of the first frame found in it.
     saved: dict[str, Any] | None = None
-    #: Where the frames of the keyframes are, so that the result can be tracked in.
+    #: Locations of the frames of the keyframes, so that the result can be used as a map.
     sources: tuple[dict[str, Any], ...] = ()
 
     def summary(self) -> dict[str, Any]:
@@ -106,7 +106,7 @@ class SequenceResult(TrackResult):
         force: bool = False,
         images: ImageFiles | None = None,
     ) -> tuple[str, ...]:
-        """Write everything that ``groma track`` writes to a folder, whole or not at all.
+        """Write the folder of results of ``groma track`` atomically.
 
         ``trajectory.txt`` (TUM), the keyframes as a COLMAP model with lines and planes beside it (``structures``),
         ``scene.npz``, ``summary.json`` and ``report.html``; further maps in ``submap_2``, ``submap_3``, ...
@@ -114,7 +114,7 @@ class SequenceResult(TrackResult):
         Parameters
         ----------
         folder : path
-            Made here.
+            The new folder.
         title : str
             Heading of the page.
         force : bool
@@ -125,7 +125,7 @@ class SequenceResult(TrackResult):
         Returns
         -------
         tuple of str
-            What could not be written, and why: trajectories and scenes are not lost to a report that fails.
+            Files that could not be written, with reasons: a failing report does not lose trajectories and scenes.
         """
         with atomic_output(folder, force) as draft:
             model = _failure("the COLMAP model", lambda: write_scene(self.scene, draft, format="colmap"))
@@ -165,13 +165,13 @@ def track(
     sequence : Sequence or path
         A sequence, or a path that :func:`groma.io.sequences.open_sequence` opens.
     options : TrackOptions, optional
-        What is tracked, and when.
+        How to track.
     progress : callable, optional
         Called after every frame; return False to end the track there. Ctrl-C does the same.
     work : path, optional
-        Folder for the keyframes that are finished, while it runs (``groma view --live``); made anew.
+        Folder for finished keyframes during the track (``groma view --live``); replaced.
     name : str
-        What the sequence is called in the summary; by default the path.
+        Name of the sequence in the summary; by default the path.
     map_ : path, optional
         OUT of an earlier track, whose map is used and extended: the track starts lost in it, and continues in its world
         frame once relocalised.
@@ -253,7 +253,7 @@ def _loaded(
     options: TrackOptions | None,
     progress: _Told,
 ) -> TrackMap | None:
-    """Return the map of an earlier track, ready to be tracked in."""
+    """Return the map of an earlier track."""
     if earlier is None:
         return None
 
@@ -271,7 +271,7 @@ def _follow(
     progress: _Told,
     journal: Journal | None,
 ) -> tuple[Tracker, bool]:
-    """Track all frames, noting in ``frames`` what became of each; return the tracker and whether none was left out.
+    """Track all frames and append them to ``frames``; return the tracker and whether the sequence was completed.
 
     If the tracker requests a restart, another one takes over.
     """
@@ -298,9 +298,9 @@ def _follow(
 
 
 def _read_ahead(sequence: Sequence, threaded: bool) -> Iterator[tuple[Frame, Frame | None]]:
-    """Yield each frame with the one after it, which is read in another thread while earlier ones are tracked.
+    """Yield each frame with the next one, which is read in another thread.
 
-    A frame that cannot be read raises in its turn.
+    The error of a frame that cannot be read is raised when it is its turn.
     """
     if not threaded:
         yield from ((frame, None) for frame in sequence)
@@ -325,12 +325,12 @@ def _compared(result: TrackResult, sequence: Sequence) -> tuple[TrajectoryScores
         return score_trajectory(result.trajectory, sequence.reference, align, MAX_TIME_DIFFERENCE), ""
     except GromaError as error:
         return None, str(error)
-    except Exception as error:  # nothing that was tracked may be lost to a comparison
+    except Exception as error:  # a failing comparison must not lose the track
         return None, f"{type(error).__name__}: {error}"
 
 
 def _without_pose(frames: list[TrackedFrame]) -> list[str]:
-    """Name the frames that have no pose, once a map was begun."""
+    """Return a warning that names the frames without a pose."""
     names = [frame.name or f"at {frame.timestamp:.3f} s" for frame in frames if frame.status in (LOST, SKIPPED)]
     if not names:
         return []

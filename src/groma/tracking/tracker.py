@@ -89,16 +89,16 @@ class Tracker:
         self._present = Present()
         self._history = History()
         self._verification = PoseVerification(self.camera, self.options)
-        # In a map of before the camera can be anywhere, as after a loss.
+        # In a saved map the camera can be anywhere, as after a loss.
         self._lost_for, self._lost_since = 0 if saved is None else self._gates.lost_frames + 1, math.nan
-        #: The frame before, if it was lost, and where it may have been taken.
+        #: The previous frame, if it was lost, and its guessed pose.
         self._guess = np.zeros((0, 0), np.uint8), self._present.pose
-        #: What happened to the track between its maps, for the reader.
+        #: Times of the losses between the submaps, for the warnings.
         self._breaks: list[tuple[float, float]] = []
-        #: What follows the answer of the frame before, and how the right camera is turned if not as was taken.
+        #: Deferred work of the previous frame, and the rotation of the right camera if the assumed one was wrong.
         self._behind = Behind(self.options.threaded)
         self._better: RightTurn | None = None
-        #: Whether the frame before had to be searched.
+        #: Whether the previous frame had to be relocalised.
         self._searched = False
         self._finished = False
 
@@ -109,7 +109,7 @@ class Tracker:
         return self._mapper.map
 
     def begun_anew(self) -> Tracker | None:
-        """End this track and return one for the same frames, if the right camera is turned far from what was taken."""
+        """If the assumed rotation of the right camera was wrong, end this track and return one for the same frames."""
         if self._better is None:
             return None
         self._finished = True
@@ -127,7 +127,7 @@ class Tracker:
         Parameters
         ----------
         frame, following
-            The frame, and the one after it if it is there already: its planes are found meanwhile, to the same result.
+            The frame and, if already read, the next one: its features are computed in parallel, with the same result.
 
         The pose is returned before the work on the map that this frame causes, which may last until the next frame.
 
@@ -173,13 +173,13 @@ class Tracker:
                 followed = find_lines_again(self.map, data, pose, followed)
         present.pose, present.data, present.followed = pose, data, followed
         present.frames_since_keyframe += 1
-        # What was found by features alone cannot be followed; the next frame needs this one's landmarks.
+        # A relocalised frame has few tracked features; the next one needs the landmarks of a keyframe.
         at_once = found is not None and mapper.due is None
         is_keyframe = at_once or self._follow_more(data, watch)
         return self._answer(self._report(frame, status, estimate, is_keyframe, began, watch), at_once)
 
     def _follow_more(self, data: FrameFeatures, watch: Stopwatch) -> bool:
-        """Find points again where there are few; choose the frame as a keyframe if it should be one."""
+        """Search further points where there are few; choose the frame as a keyframe if needed."""
         present, mapper = self._present, self._mapper
         with watch("again"):
             present.followed = find_points_again(mapper.map, data, present.pose, present.followed)
@@ -196,19 +196,19 @@ class Tracker:
         return True
 
     def _answer(self, tracked: TrackedFrame, at_once: bool = False) -> TrackedFrame:
-        """Begin with what follows the answer of a frame in the map, perhaps with a keyframe of it at once."""
+        """Start the deferred work on the map for a frame, optionally with a keyframe of it at once."""
         self._behind.begin(partial(self._mapper.advance, self._present, at_once))
         return tracked
 
     def _settle(self) -> None:
-        """Wait for what follows the answer of the frame before."""
+        """Wait for the deferred work of the previous frame."""
         watch = self._behind.result()
         if watch is not None:
             self._history.note_stages(watch.seconds)
             self._better = self._mapper.better_turn
 
     def _follow(self, data: FrameFeatures, watch: Stopwatch) -> Attempt:
-        """Predict the pose and follow the frame before, if that is not long ago."""
+        """Predict the pose and track the features of the previous frame, unless it was lost for long."""
         present = self._present
         predicted, prior_sigma = self._motion.predict(present.pose, data.frame.timestamp)
         if self._lost_for > self._gates.lost_frames:
@@ -229,7 +229,7 @@ class Tracker:
         return Attempt(predicted, prior_sigma, estimate, None, trusted, followed)
 
     def _search(self, data: FrameFeatures, attempt: Attempt, watch: Stopwatch) -> tuple[Attempt, Found | None]:
-        """Find a frame that could not be followed by described features, or keep the pose that was in doubt."""
+        """Relocalise a frame that could not be tracked by described features, or keep its doubtful pose."""
         present, mapper, unconfirmed = self._present, self._mapper, attempt.unconfirmed
         before = present.pose
         if self._lost_for == 0:
@@ -253,7 +253,7 @@ class Tracker:
         return attempt, None
 
     def _with_turn(self, data: FrameFeatures, predicted: FloatArray, prior_sigma: FloatArray):
-        """Put a turn that the whole image shows in place of a prediction that the image denies.
+        """Replace a prediction that contradicts the image by a rotation estimated from the whole image.
 
         While the previous frame has no pose, rotations from frame to frame give the approximate orientation.
         """
@@ -347,15 +347,15 @@ class Tracker:
     # ------------------------------------------------------------------------------------------------------ results
 
     def trajectory(self) -> Trajectory:
-        """Return the poses so far in the map that is followed now, as its keyframes stand; changes nothing."""
+        """Return the poses so far in the current submap, by its keyframes; changes nothing."""
         return self._history.trajectory(self.map, self._mapper.current)
 
     def scene(self) -> Scene:
-        """Return the keyframes with points, lines and planes of the map that is followed now; changes nothing."""
+        """Return the keyframes, points, lines and planes of the current submap; changes nothing."""
         return map_to_scene(self.map, self.camera, self.options.relations)
 
     def finish(self) -> TrackResult:
-        """End the track: join its maps where that is possible, adjust all keyframes together and return the result.
+        """End the track: merge its submaps where possible, adjust all keyframes together and return the result.
 
         A step that fails, or that Ctrl-C interrupts, is left out; a warning says so.
         """
@@ -369,7 +369,7 @@ class Tracker:
         roots = sorted({root for root, _ in where if mapper.maps[root].keyframes}) or [0]
         count = {root: sum(entry.submap == root for entry in history.entries) for root in roots}
         main = max(roots, key=lambda root: count[root])
-        if self._saved is not None and count[0]:  # a world that is known before comes first
+        if self._saved is not None and count[0]:  # the world of the saved map comes first
             main = 0
         others = [root for root in roots if root != main and (count[root] or self._saved is None)]
         for root in others:

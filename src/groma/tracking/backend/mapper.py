@@ -50,7 +50,7 @@ class Present:
 
 @dataclass
 class _Chosen:
-    """A frame chosen as a keyframe, with its pose in terms of a keyframe and what was followed in it."""
+    """A frame chosen as a keyframe, with its pose relative to a keyframe and its tracked features."""
 
     data: FrameFeatures
     near: int
@@ -59,8 +59,9 @@ class _Chosen:
     age: int = 0
 
     def is_ready(self, now: float, delay: int, seconds: float) -> bool:
-        """Whether frames have passed in which its features were found: so many, and so many seconds by the camera's
-        clock. No other clock is used, so that runs are reproducible.
+        """Whether ``delay`` frames and some seconds of their time stamps have passed, in which features are computed.
+
+        No other clock is used, so that runs are reproducible.
         """
         self.age += 1
         return self.age >= delay and now - self.data.frame.timestamp >= seconds
@@ -83,39 +84,39 @@ class Mapper:
         right_turn: RightTurn | None = None,
         first: TrackMap | None = None,
     ) -> None:
-        #: Maps begun so far; more than one after the track was lost for long. The first may be of an earlier track.
+        #: Submaps; more than one after the track was lost for long. The first may be of an earlier track.
         self.maps, self.current = [first or TrackMap()], 0
-        #: How maps join older ones, by the number of the newer.
+        #: Joints to older submaps, by the number of the newer one.
         self.joints: dict[int, Joint] = {}
         self.camera, self.options = camera, options
         #: The right camera of stereo pairs, and the number of keyframes at which its rotation is estimated next.
         self.right = RightCamera(camera, options.gates.rectification, options.gates.features, right_turn)
         self._next_look = options.gates.rectification.min_keyframes
-        #: What the first keyframes were made with, and whether the track may still start over.
+        #: The rotation assumed for the first keyframes, and whether the track may still restart.
         self._began_with, self._may_begin_anew = right_turn, right_turn is None
-        #: How the right camera is turned, if so far from what was taken that the track should start over.
+        #: The rotation of the right camera, if the assumed one is so far off that the track should restart.
         self.better_turn: RightTurn | None = None
         self.metric = first is None or first.is_metric
-        #: By how much inverse depths of a depth camera are off. Maps of earlier tracks were corrected then.
+        #: Offset of the inverse depths of a depth camera. Maps of earlier tracks are corrected already.
         self.depth_offset: DepthOffset | None = None
         self._begun_here = first is None
         self.loops = 0
-        #: A frame that is to become a keyframe; its features are being found meanwhile.
+        #: A frame that is to become a keyframe; its features are being computed.
         self.due: _Chosen | None = None
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="groma-adjust") if options.threaded else None
         self.workers = ThreadPoolExecutor(2, thread_name_prefix="groma-detect") if options.threaded else None
-        #: For what belongs to a frame, which keyframes must not hold up.
+        #: For the work of frames, which must not wait for keyframes.
         self.frame_pool = ThreadPoolExecutor(1, thread_name_prefix="groma-frame") if options.threaded else None
         self._pending: _Pending | None = None
         self._search: tuple[LoopSearch, Future | OnDemand] | None = None
 
     @property
     def map(self) -> TrackMap:
-        """The map that is followed now."""
+        """The current submap."""
         return self.maps[self.current]
 
     def numbers(self) -> dict:
-        """What the present map holds, and how many maps there are, as plain numbers."""
+        """Counts of the current submap, and the number of submaps, as plain numbers."""
         return {
             "keyframes": len(self.map.living()),
             "points": int(self.map.points.alive.sum()),
@@ -136,13 +137,13 @@ class Mapper:
         self.current = len(self.maps) - 1
 
     def leave(self, present: Present) -> None:
-        """Finish what was begun on the present map."""
+        """Finish pending work on the current submap."""
         self.due = None
         self.take_up(present, now=True)
 
     @property
     def threaded(self) -> bool:
-        """Whether features are found in other threads."""
+        """Whether features are computed in other threads."""
         return self.workers is not None
 
     @property
@@ -151,10 +152,9 @@ class Mapper:
         return self._pending is not None
 
     def advance(self, present: Present, at_once: bool = False) -> Stopwatch:
-        """Between two frames: take up results and make the keyframe that are due, or one of the present frame
-        at once.
+        """Apply due results and make the due keyframe between two frames, or one of the current frame at once.
 
-        Returns where the time went.
+        Returns the timings.
         """
         watch = Stopwatch()
         if at_once:
@@ -167,20 +167,20 @@ class Mapper:
             self.take_up(present)
         if self.due is not None and present.data is not None:
             gates, now = self.options.gates.keyframes, present.data.frame.timestamp
-            # The points of a single camera get their places from keyframes alone.
+            # In a monocular track points are triangulated from keyframes alone.
             if self.due.is_ready(now, *((gates.delay, gates.delay_seconds) if self.metric else (1, 0.0))):
                 self.make_keyframe(present, watch)
         return watch
 
     def adjust_start(self, present: Present) -> None:
-        """Adjust the first keyframes of a single camera."""
+        """Adjust the first keyframes of a monocular track."""
         job = window_job(self.map, self.camera, self.options.window, False, self.metric)
         if job is not None:
             job.solve()
             self.apply(present, job)
 
     def choose(self, present: Present, data: FrameFeatures) -> None:
-        """Choose the present frame as a keyframe; its features are found in other threads meanwhile."""
+        """Choose the current frame as a keyframe; its features are computed in other threads."""
         data.keep_up()
         if self.workers is not None:
             data.prepare(self.workers)
@@ -189,9 +189,9 @@ class Mapper:
         self.due = _Chosen(data, near.index, relative, present.followed)
 
     def keep_present(self, present: Present, watch: Stopwatch) -> None:
-        """Make a keyframe of the present frame, unless one stands for it, and take up all that is being worked out.
+        """Make a keyframe of the current frame, unless it is one, and apply all pending results.
 
-        Before its window is adjusted, a keyframe that was found by features alone leads the next one astray.
+        A relocalised keyframe whose window is not adjusted yet would mislead the next one.
         """
         if self.due is not None:
             self.make_keyframe(present, watch)
@@ -204,7 +204,7 @@ class Mapper:
                 self.take_up(present, now=True)
 
     def make_keyframe(self, present: Present, watch: Stopwatch) -> None:
-        """Make a keyframe of the frame that was chosen."""
+        """Make a keyframe of the chosen frame."""
         assert self.due is not None
         chosen, self.due = self.due, None
         with watch("features"):
@@ -244,7 +244,7 @@ class Mapper:
         return OnDemand(work) if self._pool is None else self._pool.submit(work)
 
     def take_up(self, present: Present, now: bool = False) -> None:
-        """Take up the result of the thread when it is due."""
+        """Apply the result of the adjustment when it is due, then that of the loop search."""
         if self._pending is not None:
             self._pending.due -= 1
             if self._pending.due > 0 and not now:
@@ -253,17 +253,17 @@ class Mapper:
             pending.future.result()
             self.apply(present, pending.job)
 
-        # Loops are closed between adjustments, which would undo them.
+        # Loops are closed between adjustments, whose results would undo them.
         if self._search is not None:
             (search, future), self._search = self._search, None
             self._close_loop(present, search, future.result())
 
     def _what_to_search(self) -> LoopSearch | None:
-        """Search the older maps until this one is joined to one of them, then this map for loops."""
+        """Search the older submaps until this one is joined to one of them, then this submap for loops."""
         newest = len(self.maps) - 1
         if 0 < newest == self.current and newest not in self.joints:
             return search_older_maps(self.maps, self.map.last, self.options.gates)
-        # Those of a single camera are closed at the end: its scale changes then.
+        # Loops of a monocular track are closed at the end, since its scale changes then.
         return search_for_loop(self.map, self.map.last, self.options.gates) if self.metric else None
 
     def _close_loop(self, present: Present, search: LoopSearch, pairs: list) -> None:
@@ -283,11 +283,11 @@ class Mapper:
             _follow_world(present, se3.compose(se3.inverse(last.pose[None]), before[None])[0])
 
     def apply(self, present: Present, job: AdjustmentJob) -> None:
-        """Take up the result of an adjustment."""
+        """Apply the result of an adjustment."""
         _follow_world(present, job.apply(self.map))
 
     def _look_at_right_camera(self, present: Present) -> None:
-        """Find now and then how the right camera is turned; correct the maps if that is not as it was taken to be."""
+        """Estimate the rotation of the right camera from time to time; correct the maps if it was assumed wrongly."""
         gates, living = self.options.gates.rectification, self.map.living()
         if not self.camera.baseline > 0 or len(living) < self._next_look:
             return
@@ -330,7 +330,7 @@ class Mapper:
         return report
 
     def abandon(self) -> None:
-        """Leave what was begun and not taken up."""
+        """Drop pending work."""
         self.due = self._pending = self._search = None
 
     def close(self) -> None:
@@ -342,13 +342,13 @@ class Mapper:
                 pool.shutdown(wait=True, cancel_futures=True)
 
     def close_scaled_loops(self, number: int) -> None:
-        """Close the loops of a map of a single camera."""
+        """Close the loops of a monocular map."""
         self.loops += close_scaled_loops(self.maps[number], self.camera, self.options)
 
     def adjust_at_end(self, number: int) -> tuple[SolveReport | None, RightTurn]:
-        """Adjust all keyframes of a map together; return the report and how the right camera is turned.
+        """Adjust all keyframes of a map together; return the report and the rotation of the right camera.
 
-        What is wrong with right images or depths is estimated and corrected first.
+        Errors of that rotation, or of depths, are estimated and corrected first.
         """
         self.current = number
         turn = self.right.turn

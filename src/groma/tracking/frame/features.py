@@ -77,7 +77,7 @@ class Features:
     descriptor: Descriptors
     #: (N,) depth; NaN where unknown.
     depth: FloatArray
-    #: (N,) the map's point at this feature, or -1.
+    #: (N,) the point of the map at this feature, -1 for none.
     point: IntArray
 
     def __post_init__(self) -> None:
@@ -92,7 +92,7 @@ class Features:
         return cls(np.zeros((0, 2)), none, none, np.zeros((0, 32), np.uint8), none, np.zeros(0, np.int64))
 
     def linked(self, rows: IntArray, points: IntArray) -> Features:
-        """Return the features with points of the map at some of them."""
+        """Return the features, some of them linked to points of the map."""
         point = self.point.copy()
         point[rows] = points
         return replace(self, point=point)
@@ -108,7 +108,7 @@ class DetectedSegments:
 
 
 class FrameFeatures:
-    """One frame and what was found in it so far."""
+    """One frame and its features, computed on demand."""
 
     def __init__(
         self, frame: Frame, camera: TrackCamera, options: TrackOptions, right_camera: RightCamera | None = None
@@ -134,28 +134,28 @@ class FrameFeatures:
 
     @property
     def corner_cell(self) -> int:
-        """Width of the cells of the image that get a point each, pixels."""
+        """Width of the image cells with one point each, pixels."""
         return max(12, int(math.sqrt(self.gray.size / self.options.num_points)))
 
     @_FoundOnce
     def corners(self) -> FloatArray:
-        """Corners (N, 2) worth following, strongest first."""
+        """Corners (N, 2) for tracking, strongest first."""
         distance = self.options.gates.points.corner_distance * self.corner_cell
         return corners(self.gray, self.options.num_points, distance)
 
     def lock_of(self, name: str) -> Any:
-        """Return the lock of one thing to be found."""
+        """Return the lock of one property."""
         return self._locks.setdefault(name, RLock())
 
     def prepare(self, pool: Executor) -> None:
-        """Begin with what a keyframe needs, in other threads; :meth:`wait` ends it."""
+        """Start the computations for a keyframe in other threads; :meth:`wait` ends them."""
         wanted = {"features": True, "detected": self.options.lines, "corners": self.options.points}
         names = [name for name, is_wanted in wanted.items() if is_wanted and name not in vars(self)]
         self._work += [pool.submit(getattr, self, name) for name in names]
 
     def prepare_ahead(self, pool: Executor, searching: Executor | None = None) -> None:
-        """Begin in other threads with what depends on this image alone; with what a search needs where one is given."""
-        if self.frame.right is not None:  # how that camera is turned may become known better meanwhile
+        """Start computations of this image alone in other threads, with an executor those of a relocalisation, too."""
+        if self.frame.right is not None:  # the estimated rotation of that camera may change
             return
         for name in ("planes", "small"):
             pool.submit(getattr, self, name)
@@ -171,7 +171,7 @@ class FrameFeatures:
 
     @_FoundOnce
     def smooth(self) -> SmoothImage:
-        """The image in which edges are measured."""
+        """The smoothed image in which edges are measured."""
         return smoothed(self.gray)
 
     @_FoundOnce

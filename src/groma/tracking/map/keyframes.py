@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""When a frame becomes a keyframe, and what it then adds to the map: points, lines and planes."""
+"""Selection of keyframes, and the points, lines and planes that they add to the map."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def measure_points(
     pose: FloatArray,
     camera: TrackCamera,
 ) -> PointMeasurements:
-    """Return what a frame measures of followed points: pixel, and depth or right column where it has them."""
+    """Return the measurements of tracked points: pixel, and depth or right column where known."""
     count = len(tracks)
     unknown = np.full(count, np.nan)
     depth, right = unknown, np.full((count, 2), np.nan)
@@ -126,14 +126,14 @@ def measure_points(
 def _add_points(
     track_map, camera, data, pose, tracks: PointTracks, index: int, options
 ) -> tuple[PointTracks, Features]:
-    """Place followed points whose place has become known, start new ones, and link described features to points."""
+    """Triangulate pending points, start new ones, and link described features to points."""
     points, gates = track_map.points, options.gates.points
     features = data.features
     _place_pending(track_map, camera, data, pose, tracks)
     if len(tracks):
         points.keyframe[tracks.index], points.pixel[tracks.index] = index, tracks.pixel
     if options.points:
-        # Described features near followed points are these points.
+        # Described features near tracked points belong to them.
         if len(features.pixel) and len(tracks):
             found = KDTree(features.pixel).query(tracks.pixel, distance_upper_bound=gates.same_feature)
             distance, nearest = np.asarray(found[0]), np.asarray(found[1])
@@ -141,7 +141,7 @@ def _add_points(
             features = features.linked(nearest[rows], tracks.index[rows])
         depthless = data.frame.depth is None and data.frame.right is None
         if depthless and track_map.keyframes and points.alive[tracks.index].sum() < gates.few * options.num_points:
-            # After a wide step hardly any point was followed, but many features are seen again.
+            # After a wide step few points are tracked, but many features match.
             before = track_map.near
             placed, features = place_by_motion(track_map, camera, before, features, pose, tracks.index, options)
             tracks = tracks.joined(placed)
@@ -176,7 +176,7 @@ def _add_points(
 
 
 def _place_pending(track_map: TrackMap, camera: TrackCamera, data: FrameFeatures, pose, tracks: PointTracks) -> None:
-    """Place followed points that have no place: from this frame's depth, or from motion since they were first seen."""
+    """Initialise pending points by depth, or by triangulation with the keyframe that first saw them."""
     points = track_map.points
     pending = np.flatnonzero(points.state[tracks.index] == PENDING)
     if not len(pending):
@@ -204,11 +204,11 @@ def _poses_of(track_map: TrackMap, keyframes: IntArray) -> FloatArray:
 
 
 def _add_lines(track_map, camera, data, pose, followed: FollowedSegments, index: int, options):
-    """Assign detected segments to followed lines and to lines of the map, and start new lines with the rest."""
+    """Assign detected segments to tracked lines and to lines of the map, and start new lines with the rest."""
     lines, detected, gates = track_map.lines, data.detected, options.gates.lines
     segments = detected.segments
     of_segment = np.full(len(segments), -1)
-    # Segments of lines that are followed already.
+    # Segments of tracked lines.
     rows, hits = assign(followed.ends, segments.ends, gates.distance, gates.angle, gates=gates)
     of_segment[hits] = followed.index[rows]
     # Segments of other lines of the map.
@@ -221,7 +221,7 @@ def _add_lines(track_map, camera, data, pose, followed: FollowedSegments, index:
     inverse = detected.inverse_depth.mean(axis=1)
     rows, hits = assign(expected, segments.ends[free], gates.distance, gates.angle, middle, inverse[free], gates)
     of_segment[free[hits]] = alive[rows]
-    # New lines: with a place where the depth is known along the segment, else followed until motion gives one.
+    # New lines: initialised by depth along the segment, else tracked until they can be triangulated.
     free = np.flatnonzero(of_segment < 0)[: max(options.num_lines - int((of_segment >= 0).sum()), 0)]
     new = lines.extend(len(free))
     of_segment[free] = new
@@ -237,14 +237,14 @@ def _add_lines(track_map, camera, data, pose, followed: FollowedSegments, index:
     table = LineMeasurements(
         known, segments.ends[rows], sigma, detected.inverse_depth[rows], detected.inverse_depth_sigma[rows]
     )
-    # A line is followed by its longest segment only.
+    # A line is tracked by its longest segment only.
     followed = FollowedSegments(known, segments.ends[rows], sigma, segments.strength[rows])
     first = np.unique(known, return_index=True)[1]
     return followed.take(first), table.take(first)
 
 
 def place_from_depth(track_map, camera, pose, index, ends, detected, rows, gates: LineGates) -> None:
-    """Place lines whose segment has a depth along it that is known well enough."""
+    """Initialise lines whose segment has a sufficiently certain depth."""
     inverse, sigma = detected.inverse_depth[rows], detected.inverse_depth_sigma[rows]
     with np.errstate(invalid="ignore", divide="ignore"):
         depth = 1.0 / inverse
@@ -264,7 +264,7 @@ def _place(track_map: TrackMap, index, segments: FloatArray) -> None:
 
 
 def _place_pending_lines(track_map, camera, pose, known, ends, detected, rows, index, gates) -> None:
-    """Place followed lines: from depth, or where the planes through two camera centres and the segments meet."""
+    """Initialise pending lines by depth, or by the planes through two camera centres and the segments."""
     lines = track_map.lines
     pending = np.flatnonzero((lines.state[known] == PENDING) & (lines.first_keyframe[known] < index))
     if not len(pending):
@@ -280,7 +280,7 @@ def _place_pending_lines(track_map, camera, pose, known, ends, detected, rows, i
     direction = np.cross(normal1, normal2)
     sine = np.linalg.norm(direction, axis=1)
     good = sine > gates.min_sine
-    # The rays of the present ends meet the first plane.
+    # Intersections of the rays of the current ends with the first plane.
     out = np.zeros((len(row), 2, 3))
     for k in (0, 1):
         ray = back(pose, camera.bearings(segment[:, 2 * k : 2 * k + 2])) - center2
@@ -329,7 +329,7 @@ def _extend_lines(track_map: TrackMap, camera: TrackCamera, pose, index, ends, m
 
 
 def _add_planes(track_map: TrackMap, data: FrameFeatures, pose: FloatArray) -> PlaneMeasurements:
-    """Assign planes of the frame to planes of the map, which grow, and start new ones with the rest."""
+    """Assign planes of the frame to planes of the map, which are extended, and start new ones with the rest."""
     seen = data.planes
     assert seen is not None
     gates = data.options.gates.planes
@@ -337,7 +337,7 @@ def _add_planes(track_map: TrackMap, data: FrameFeatures, pose: FloatArray) -> P
     for k, row in zip(index, rows, strict=True):
         grow(track_map.planes, int(k), back(pose, seen.places_of(row)), float(seen.support[row]), gates)
     rest = np.setdiff1d(np.arange(len(seen)), rows)
-    # Nothing new beside a plane that is there already but did not agree well enough.
+    # No new plane near an existing one that did not agree well enough.
     _, ambiguous = assign_planes(track_map.planes, seen, pose, gates.wide_angle, gates.wide_distance, gates)
     rest = np.setdiff1d(rest, ambiguous)
     index = np.concatenate([index, add_planes(track_map.planes, seen, rest, pose, gates)])
