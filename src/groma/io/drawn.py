@@ -120,10 +120,6 @@ def drawn(scene: Scene, parts: Collection[Part] = PARTS) -> Drawn:
 def drawn_cameras(scene: Scene) -> DrawnCameras:
     """Return the cameras of a scene."""
     world_from_cam = se3.to_matrix(se3.inverse(scene.cam_from_world))
-    if world_from_cam.shape[1] == 3:
-        world_from_cam = np.concatenate(
-            [world_from_cam, np.broadcast_to([[[0.0, 0, 0, 1]]], (len(world_from_cam), 1, 4))], axis=1
-        )
     opening, aspect = openings(scene)
     return DrawnCameras(scene.images.names, world_from_cam, opening, aspect, _depth(world_from_cam[:, :3, 3]))
 
@@ -153,19 +149,36 @@ def openings(scene: Scene) -> tuple[FloatArray, FloatArray]:
     return opening[scene.images.camera_idx], aspect[scene.images.camera_idx]
 
 
+def typical_gap(centers: FloatArray) -> float:
+    """Return the median distance of at least two cameras from their nearest neighbours."""
+    from scipy.spatial import KDTree
+
+    return float(np.median(KDTree(centers).query(centers, k=2)[0][:, 1]))
+
+
+def light(colours: npt.ArrayLike) -> FloatArray:
+    """Return linear intensities from 0 to 1 of sRGB colours in bytes."""
+    share = np.asarray(colours, float) / 255.0
+    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+
+
 def _depth(centers: FloatArray) -> float:
     if len(centers) < 2:
         return 1.0
-    from scipy.spatial import KDTree
-
-    gap = float(np.median(KDTree(centers).query(centers, k=2)[0][:, 1]))
+    gap = typical_gap(centers)
     extent = float(np.linalg.norm(np.subtract(*np.percentile(centers, [95, 5], axis=0))))
     return float(np.clip(0.4 * gap, 0.005 * extent, 0.1 * extent)) or 1.0
 
 
 def _line_colours(scene: Scene) -> Colours:
     """One colour per shared direction."""
-    colours = np.tile(np.array(_LINE_COLOUR, np.uint8), (scene.num_lines, 1))
-    line, direction = scene.relations.line_along_direction.T
-    colours[line] = PALETTE[direction % len(PALETTE)]
-    return colours
+    direction = direction_of_lines(scene)
+    return np.where((direction >= 0)[:, None], PALETTE[direction % len(PALETTE)], np.array(_LINE_COLOUR, np.uint8))
+
+
+def direction_of_lines(scene: Scene) -> IntArray:
+    """Return the direction that each line follows (L,), -1 for none."""
+    direction = np.full(scene.num_lines, -1, np.int64)
+    line, along = scene.relations.line_along_direction.T
+    direction[line] = along
+    return direction

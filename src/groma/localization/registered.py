@@ -9,7 +9,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from groma import cameras as camera_models
 from groma._typing import IntArray
 from groma.errors import InputError
 from groma.localization.map_index import MapIndex
@@ -52,12 +51,7 @@ def _images(scene: Scene, queries: Sequence[PlacedImage]) -> dict[str, Table]:
     every, count = np.arange(len(distinct)), len(queries)
     taken = max(int(ids.max(initial=0)) for ids in (scene.cameras.ids, scene.rigs.ids, scene.sensors.sensor_ids))
     ids = taken + 1 + every
-    width = max(camera_models.model(one.model).num_parameters for one in distinct.values())
-    params = np.zeros((len(distinct), width))
-    for row, one in enumerate(distinct.values()):
-        params[row, : len(one.params)] = one.params
-    size = np.stack([one.size for one in distinct.values()])
-    models = tuple(one.model for one in distinct.values())
+    models, params, sizes = zip(*((one.model, one.params, one.size) for one in distinct.values()), strict=True)
     sensors = Sensors(
         len(scene.rigs) + every, np.full(len(every), CAMERA), ids, len(scene.cameras) + every,
         np.tile([0, 0, 0, 1, 0, 0, 0.0], (len(every), 1)), np.ones(len(every), int), np.ones(len(every), int),
@@ -66,7 +60,7 @@ def _images(scene: Scene, queries: Sequence[PlacedImage]) -> dict[str, Table]:
     number = first + np.arange(count)
     frames = Frames(number, len(scene.rigs) + which, np.stack([one.pose for one in queries]))
     return {
-        "cameras": Cameras(ids, models, params, size[:, 0], size[:, 1]),
+        "cameras": Cameras.of(ids, models, params, sizes),
         "rigs": Rigs(ids),
         "sensors": sensors,
         "frames": frames,

@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from groma import cameras as camera_models
 from groma._typing import FloatArray, IntArray
@@ -52,6 +53,17 @@ class Cameras(Table, noun="camera"):
                 f"Camera {self.ids[row]} has {self.width[row]} x {self.height[row]} pixels; width and height must "
                 "both be positive, or both 0."
             )
+
+    @classmethod
+    def of(
+        cls, ids: npt.ArrayLike, models: Sequence[str], params: Sequence[npt.ArrayLike], sizes: npt.ArrayLike
+    ) -> Cameras:
+        """Return cameras with their parameters, of any numbers, and sizes (C, 2) as width and height."""
+        padded = np.zeros((len(params), max(map(np.size, params), default=0)))
+        for row, values in enumerate(params):
+            padded[row, : np.size(values)] = values
+        width, height = np.reshape(np.asarray(sizes, np.int64), (-1, 2)).T
+        return cls(np.asarray(ids, np.int64), tuple(models), padded, width, height)
 
     @property
     def num_params(self) -> list[int]:

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
+from groma.io.drawn import direction_of_lines
 from groma.scene import Scene
 from groma.scene.patches import PALETTE
 
@@ -43,10 +44,7 @@ def of_lines(scene: Scene) -> Colours:
 
 def of_shared_directions(scene: Scene) -> Colours:
     """Colours (L, 3) of lines by the direction that they share with others; grey for those that share none."""
-    group = np.full(scene.num_lines, -1)
-    along = scene.relations.line_along_direction
-    group[along[:, 0]] = along[:, 1]
-    return of_group(group)
+    return of_group(direction_of_lines(scene))
 
 
 def common_frame(vectors: FloatArray, weights: FloatArray) -> FloatArray:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray
+from groma.io.drawn import typical_gap
 from groma.scene.local_frame import upward
 from groma.viz.drawable import Drawable
 
@@ -145,7 +146,4 @@ def _camera_size(scene: Drawable, distance: float) -> float:
     """Return a size at which cameras are visible and neighbours do not overlap."""
     if len(scene.centers) < 3:
         return 0.018 * distance
-    from scipy.spatial import KDTree
-
-    gap = float(np.median(KDTree(scene.centers).query(scene.centers, k=2)[0][:, 1]))
-    return float(np.clip(0.4 * gap, 0.004 * distance, 0.018 * distance))
+    return float(np.clip(0.4 * typical_gap(scene.centers), 0.004 * distance, 0.018 * distance))

@@ -60,11 +60,10 @@ def cameras_of_photographs(
             "out, or map the photographs of one camera."
         )
     row_of = {key: row for row, key in enumerate(cameras)}
-    table = Cameras(
+    table = Cameras.of(
         ids=np.arange(len(cameras)) + 1,
-        models=(camera_models.model(model).name,) * len(cameras),
-        params=np.array([one[2] for one in cameras.values()], float),
-        width=np.array([one[0] for one in cameras.values()], np.int64),
-        height=np.array([one[1] for one in cameras.values()], np.int64),
+        models=[camera_models.model(model).name] * len(cameras),
+        params=[one[2] for one in cameras.values()],
+        sizes=[one[:2] for one in cameras.values()],
     )
     return table, np.array([row_of[key] for key in keys], np.int64)

@@ -178,16 +178,11 @@ def _cameras(reconstruction: pycolmap.Reconstruction) -> Cameras:
                 f"{', '.join(known)}). "
                 "Undistort the images, or register the model with groma.cameras.register_camera."
             )
-    longest = max((len(camera.params) for _, camera in found), default=0)
-    params = np.zeros((len(found), longest))
-    for row, (_, camera) in enumerate(found):
-        params[row, : len(camera.params)] = camera.params
-    return Cameras(
-        ids=np.array([number for number, _ in found], np.int64),
-        models=tuple(known[camera.model_name] for _, camera in found),
-        params=params,
-        width=np.array([camera.width for _, camera in found], np.int64),
-        height=np.array([camera.height for _, camera in found], np.int64),
+    return Cameras.of(
+        ids=[number for number, _ in found],
+        models=[known[camera.model_name] for _, camera in found],
+        params=[camera.params for _, camera in found],
+        sizes=[(camera.width, camera.height) for _, camera in found],
     )
 
 

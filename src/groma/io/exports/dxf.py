@@ -19,7 +19,7 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.errors import InputError
 from groma.io.atomic import atomic_output
-from groma.io.drawn import Drawn, drawn, drawn_cameras
+from groma.io.drawn import Drawn, direction_of_lines, drawn, drawn_cameras
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Scene
 from groma.scene.checks import check_scene_given
@@ -61,8 +61,6 @@ def check_dxf(scene: Scene) -> None:
 
 def _groups(scene: Scene) -> Iterator[Group]:
     geometry, frusta = drawn(scene), drawn_cameras(scene).frusta().reshape(-1, 2, 3)
-    direction = np.full(scene.num_lines, -1)
-    direction[scene.relations.line_along_direction[:, 0]] = scene.relations.line_along_direction[:, 1]
     shared = [f"LINES_{number}" for number in scene.directions.ids.tolist()]
     colours = [_DIRECTION_COLOURS[k % len(_DIRECTION_COLOURS)] for k in range(len(shared))]
     layers = [*_LAYERS, *zip(shared, colours, strict=True)]
@@ -70,7 +68,7 @@ def _groups(scene: Scene) -> Iterator[Group]:
     yield from _tables(layers)
     yield from [(0, "SECTION"), (2, "ENTITIES")]
     yield from _points("POINTS", geometry.points)
-    names = np.array([*shared, "LINES"])[direction[geometry.piece_line]] if len(geometry.pieces) else ()
+    names = np.array([*shared, "LINES"])[direction_of_lines(scene)[geometry.piece_line]] if len(geometry.pieces) else ()
     yield from _strokes(names, geometry.pieces)
     yield from _polygons(geometry)
     yield from _points("CAMERAS", scene.cam_centers_in_world)

@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from groma._typing import FloatArray
 from groma.io.atomic import atomic_output
-from groma.io.drawn import Colours, DrawnCameras, drawn, drawn_cameras, middle_of
+from groma.io.drawn import Colours, DrawnCameras, drawn, drawn_cameras, light, middle_of
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Scene
 from groma.scene.checks import check_scene_given
@@ -164,10 +164,8 @@ def _finish(document: _Document) -> None:
 
 def _glass(colour: list[int]) -> dict[str, Any]:
     """A material seen from both sides that shows what lies behind it; glTF takes colours as amounts of light."""
-    share = np.asarray(colour) / 255.0
-    light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     return {
-        "pbrMetallicRoughness": {"baseColorFactor": [*light.tolist(), _PLANE_ALPHA], "metallicFactor": 0.0},
+        "pbrMetallicRoughness": {"baseColorFactor": [*light(colour).tolist(), _PLANE_ALPHA], "metallicFactor": 0.0},
         "alphaMode": "BLEND",
         "doubleSided": True,
     }

@@ -13,6 +13,7 @@ give pairs of g and s, and linear least squares the rational function of FULL_OP
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -119,20 +120,16 @@ def inverse_polynomial(
 
 def camera_table(calibrations: Sequence[Calibration], path: object) -> Cameras:
     """Return calibrations as a table with identifiers 1, 2, ...; FileFormatError if a focal length is not positive."""
-    longest = max((len(one.params) for one in calibrations), default=0)
-    params = np.zeros((len(calibrations), longest))
     for row, one in enumerate(calibrations):
-        params[row, : len(one.params)] = one.params
         if any(not one.params[index] > 0.0 for index in camera_models.model(one.model).focal_indices):
             raise FileFormatError(f"{path}: expected positive focal lengths; camera {row + 1} has {one.params[:2]}.")
-    if not np.isfinite(params).all():
+    if not all(math.isfinite(value) for one in calibrations for value in one.params):
         raise FileFormatError(f"{path}: the numbers of a camera are too large. Correct the file.")
-    return Cameras(
+    return Cameras.of(
         ids=np.arange(len(calibrations)) + 1,
-        models=tuple(one.model for one in calibrations),
-        params=params,
-        width=np.array([one.size[0] for one in calibrations], np.int64),
-        height=np.array([one.size[1] for one in calibrations], np.int64),
+        models=[one.model for one in calibrations],
+        params=[one.params for one in calibrations],
+        sizes=[one.size for one in calibrations],
     )
 
 

@@ -181,11 +181,7 @@ def _cameras(cameras: Cameras, wide: Sequence[WideViews | None]) -> tuple[Camera
         models += ["PINHOLE"] * len(views)
         params += list(views.pinhole)
         sizes += views.view_size.tolist()
-    padded = np.zeros((len(models), max(map(len, params))))
-    for row, values in enumerate(params):
-        padded[row, : len(values)] = values
-    width, height = np.array(sizes, np.int64).T
-    return Cameras(np.arange(len(models)) + 1, tuple(models), padded, width, height), first
+    return Cameras.of(np.arange(len(models)) + 1, models, params, sizes), first
 
 
 def _in_views(views: WideViews | None, segments: Segments) -> list[tuple[IntArray, Segments]]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.io.drawn import direction_of_lines
 from groma.scene import Scene
 from groma.scene.line_intervals import line_pieces
 from groma.scene.patches import PALETTE, patch_area, patch_groups
@@ -83,10 +84,8 @@ def _points(scene: Scene, after: Drawable, kept: Kept) -> dict[str, Any]:
 
 
 def _lines(scene: Scene, numbers: LineStatistics, kept: Kept) -> dict[str, Any]:
-    direction = np.full(scene.num_lines, -1, np.int64)
-    along = scene.relations.line_along_direction
-    direction[along[:, 0]] = along[:, 1]
-    shared = pack_bytes(_colours.of_shared_directions(scene)[kept.lines]) if len(along) else ""
+    direction = direction_of_lines(scene)
+    shared = pack_bytes(_colours.of_shared_directions(scene)[kept.lines]) if (direction >= 0).any() else ""
     return {
         "ids": pack_whole(scene.lines.ids[kept.lines]),
         "images": pack_whole(numbers.num_images[kept.lines]),

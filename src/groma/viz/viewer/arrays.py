@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.io.drawn import light, typical_gap
 from groma.scene.patches import PALETTE, patch_groups, triangle_fans
 from groma.viz.colours import Colours
 from groma.viz.viewer.content import REACH
@@ -22,9 +23,7 @@ def by_end(colours: Colours) -> Colours:
 
     The page takes the colours of segment ends, unlike all others, as linear intensities.
     """
-    share = np.asarray(colours, float) / 255.0
-    light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
-    return np.repeat(np.round(255.0 * light).astype(np.uint8)[:, None], 2, axis=1)
+    return np.repeat(np.round(255.0 * light(colours)).astype(np.uint8)[:, None], 2, axis=1)
 
 
 def point_size(count: int) -> float:
@@ -36,10 +35,7 @@ def camera_scale(centers: FloatArray) -> float:
     """Return the size of drawn cameras at which neighbours do not overlap, within limits."""
     if len(centers) < 2:
         return 0.08 * REACH
-    from scipy.spatial import KDTree
-
-    gap = float(np.median(KDTree(centers).query(centers, k=2)[0][:, 1]))
-    return float(np.clip(0.45 * gap, 0.02 * REACH, 0.12 * REACH))
+    return float(np.clip(0.45 * typical_gap(centers), 0.02 * REACH, 0.12 * REACH))
 
 
 def add_segments(
