@@ -95,7 +95,7 @@ def uncertainty(
         open inner.
     sigma0 : float
         Covariances are multiplied by its square; pass the root of the report's ``reduced_chi_square`` where the stated
-        noise is not to be believed.
+        noise is not credible.
     problem : Problem, optional
         The problem already made from the scene, at its solution. For ``inner`` its frames are freed; for ``held`` the
         first camera and the scale are held unless the problem has held variables.

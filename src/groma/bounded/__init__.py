@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Reading files that nobody vouches for: sizes are known before bytes are expanded, names stay in their folder.
+"""Reading files that are not trusted: sizes are known before bytes are expanded, names stay in their folder.
 
 In come files as they lie on disk; out come bytes, lines of text, arrays and images, each within a bound that follows
 from the size of the file, or a :class:`~groma.errors.FileFormatError` with the bound. All readers stand on these

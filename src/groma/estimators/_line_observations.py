@@ -14,7 +14,7 @@ from groma.geometry.algebra import apply, cofactor, dot, matrices, ratio, stack,
 
 
 class TriangulationStatus(IntEnum):
-    """What became of a line."""
+    """The outcome for a line."""
 
     #: A line.
     OK = 0

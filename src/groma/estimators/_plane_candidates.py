@@ -323,7 +323,7 @@ class Scores:
         def fill(piece: int) -> None:
             part = slice(cuts[piece], cuts[piece + 1])
             try:
-                room = self._rooms.pop()  # nobody else's until it is put back
+                room = self._rooms.pop()  # exclusive until it is put back
             except IndexError:
                 room = _Room(len(features.places))
             scores_loop(

@@ -45,7 +45,7 @@ TRIMS = TrimGates()
 
 
 class TrimStatus(IntEnum):
-    """What became of an end point."""
+    """The outcome for an end point."""
 
     #: A point in front of the camera.
     OK = 0

@@ -100,7 +100,7 @@ def _with_earlier_distances(members: ArrayMembers, table: Distances) -> Distance
 
 
 def _refuse_unknown(members: ArrayMembers, tables: Mapping[str, Any], place: Path) -> None:
-    """Raise if an archive holds what a scene has no place for: it would be lost where the scene is written again."""
+    """Raise if an archive holds what a scene cannot represent: it would be lost where the scene is written again."""
     known = {"format", "version"} | {f"{name}.{item.name}" for name, kind in tables.items() for item in fields(kind)}
     known |= {f"{name}.{column}" for name in _OF_DISTANCES for column in _COLUMNS_OF_DISTANCES}
     if unknown := [name for name in members.names if name not in known]:

@@ -24,7 +24,7 @@ FLIP = np.array([1.0, -1.0, -1.0])
 class PoseConvention:
     """How one kind of file holds the pose of a camera."""
 
-    #: The kind of file, as people call it.
+    #: The usual name of the kind of file.
     name: str
     direction: Literal["cam_from_world", "world_from_cam"]
     #: How the rotation is written; quaternions by the order of their numbers.

@@ -189,7 +189,7 @@ def _unclear(place: Path, count: int, names: Sequence[str], what: str) -> InputE
 
 # ------------------------------------------------------------------------------------------------------------- names
 def _by_name(place: Path, names: Sequence[str], photographs: Sequence[str]) -> tuple[list[str | None], tuple[str, ...]]:
-    """Return the photograph of each name, None where there is none, and what was concluded."""
+    """Return the photograph of each name, None where there is none, and sentences about the matching."""
     rows = rows_by_name(names, photographs)
     if (unclear := np.flatnonzero(rows == SEVERAL)).size:
         raise InputError(

@@ -116,7 +116,7 @@ class FactorLayout:
     factor: Factor
     #: First column of each reference in a record, as :meth:`Factor.linearize` takes them.
     columns: tuple[int, ...]
-    #: Doubles in one row of a record, and whether some of them are written by nobody and must be zero.
+    #: Doubles in one row of a record, and whether some of them are never written and must be zero.
     width: int
     has_gaps: bool
     chains: tuple[Chain, ...]

@@ -72,13 +72,13 @@ class Problem:
         }
         if any(len(group) != len(self.variables[name]) for name, group in variables.items()):
             return Problem(variables, self.factors)
-        moved = copy.copy(self)  # what was checked once holds for other states, too
+        moved = copy.copy(self)  # the checks hold for other states, too
         object.__setattr__(moved, "variables", variables)
         return moved
 
     def with_losses(self, losses: Sequence[Loss]) -> Problem:
         """Return the same problem with other losses, one for each group of factors."""
-        other = copy.copy(self)  # a loss has no part in what was checked
+        other = copy.copy(self)  # the checks do not concern losses
         object.__setattr__(other, "factors", tuple(map(under_loss, self.factors, losses)))
         return other
 

@@ -66,7 +66,7 @@ def column(
     measured : bool
         Measured in the world by another instrument: not transformed when the scene is moved to fit.
     check : callable, optional
-        Takes the name of the column and its numbers, and raises where they are not what they must be.
+        Takes the name of the column and its numbers, and raises where they are not valid.
     """
     empty = tuple(0 if size is None else size for size in row)
     about = {"dtype": np.dtype(dtype), "row": row, "fill": fill, "optional": optional}

@@ -50,7 +50,7 @@ class Trial:
         """Whether the cost is below that of ``best``.
 
         A factor that became degenerate counts nothing. Its ``share`` of the cost is put back, because steps would
-        otherwise hide what they spoil.
+        otherwise hide their effect.
         """
         return self.cost + max(0, self.num_hidden - best.num_hidden) * share < best.cost
 
@@ -89,7 +89,7 @@ class DampedProblem(Protocol[T]):
         """Solve for a step and evaluate the states after it; :meth:`Trial.without_step` where there is none."""
 
     def stretch(self, trial: T, factor: float) -> T:
-        """Evaluate a multiple of the step of a trial; return the trial itself where that is not worth it."""
+        """Evaluate a multiple of the step of a trial; return the trial itself where multiples do not apply."""
 
     def refine(self, trial: T) -> T:
         """Improve a trial that will be accepted; the trial itself where there is nothing to improve it with."""

@@ -133,7 +133,7 @@ class IndependentBlocks:
         return costs
 
     def _prepared(self, states: States) -> list[tuple]:
-        """Return what factors read of the states, which nobody changes; of those asked for last, what was found."""
+        """Return what factors read of the states; read-only. The last states are cached."""
         if self._last is None or self._last[0] is not states:
             self._last = None  # its memory is free for the next one
             self._last = states, self.equations.prepare(states)

@@ -30,7 +30,7 @@ ROUNDING_DAMPING = 1e-15
 
 
 class Damping(Protocol):
-    """The damping of a joint step, adapted to what became of the steps before."""
+    """The damping of a joint step, adapted to the outcome of the steps before."""
 
     value: float
 

@@ -58,7 +58,7 @@ class SimilarityMotions:
 
 @dataclass(frozen=True, eq=False)
 class SimilarityGraphResult:
-    """The adjusted cameras, and how they got there."""
+    """The adjusted cameras, and the course of the adjustment."""
 
     #: (N, 8) similarities, cam_from_world.
     cam_from_world: FloatArray

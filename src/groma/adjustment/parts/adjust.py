@@ -39,7 +39,7 @@ from groma.solver.solve import Progress
 
 @dataclass(frozen=True)
 class PartsResult:
-    """The adjusted parts and how they came about."""
+    """The adjusted parts, and the course of the adjustment."""
 
     #: The archives written, in the order of the parts given.
     paths: tuple[Path, ...]

@@ -256,7 +256,7 @@ def _gauge(options: AssemblyOptions, facts: Sequence[dict[str, Any]]) -> str:
 
 
 def _owners(sizes: Sequence[int], count: int) -> np.ndarray:
-    """Return the rank each part belongs to: the largest first, each to who has the least so far."""
+    """Return the rank each part belongs to: the largest first, each to the rank with the least so far."""
     load, owner = np.zeros(count), np.zeros(len(sizes), int)
     for number in sorted(range(len(sizes)), key=lambda number: -sizes[number]):
         owner[number] = int(np.argmin(load))

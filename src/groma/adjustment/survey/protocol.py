@@ -88,7 +88,7 @@ def _tests(survey: Mapping[str, Any]) -> str:
 
 
 def _given_poses(told: Mapping[str, Any]) -> str:
-    """Return what poses without a stated noise were found to be worth."""
+    """Return the estimated noise of poses without a stated one."""
     rows = [("", "sigma, estimated", "rms residual")]
     rows += [("shift along an axis", f"{told['sigma']:.4g}", f"{told['rms']:.4g}")]
     rows += [("turn about an axis (degrees)", f"{told['sigma_deg']:.4g}", f"{told['rms_deg']:.4g}")]

@@ -234,7 +234,7 @@ def _rows_of(scene: Scene, groups: Collection[str]) -> dict[str, Iterator[IntArr
 
 
 def _name(scene: Scene, kind: str, row: int) -> str:
-    """Return what a person calls a measurement."""
+    """Return the readable name of a measurement."""
     table = getattr(scene, TABLES[kind])
     if kind in ("camera position", "camera pose"):
         return scene.images.names[table.image_idx[row]]

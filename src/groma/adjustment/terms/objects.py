@@ -50,7 +50,7 @@ def arms_of(scene: Scene, kind: Kind, index: IntArray, anchor: FloatArray) -> Fl
 
 
 def name_of(scene: Scene, kind: int, index: int) -> str:
-    """Return what a person calls an object."""
+    """Return the readable name of an object."""
     if kind in (Kind.IMAGE, Kind.CONTROL_POINT):
         return (scene.images if kind == Kind.IMAGE else scene.control_points).names[index]
     table = (scene.lines, scene.planes, scene.points, scene.directions)[kind - Kind.LINE]
@@ -75,7 +75,7 @@ def with_held(variables: dict[str, Variables], scene: Scene) -> dict[str, Variab
 def with_held_states(before: Problem, after: Problem, moved: IntArray) -> tuple[Problem, IntArray]:
     """Return a problem whose landmarks were started anew with the held ones where they were, and the lines that moved.
 
-    A rescue solves for landmarks one by one and compares their costs; what is held is not its to decide.
+    A rescue solves for landmarks one by one and compares their costs; it must not move those that are held.
     """
     held = {name: group.free_coordinates() for name, group in before.variables.items()}
     rows = {name: np.flatnonzero(~free.any(axis=1)) for name, free in held.items() if free is not None}

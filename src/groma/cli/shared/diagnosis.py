@@ -41,7 +41,7 @@ def try_diagnosis(
         with console.stages() as say:
             say(DIAGNOSING, 0, 1)
             return make()
-    except Exception as error:  # of any kind: the result is worth more
+    except Exception as error:  # of any kind: the result must not be lost for it
         console.warn(f"The diagnosis failed: {error}")
         return None
 

@@ -36,7 +36,7 @@ from groma.scene import Scene
 #: Bytes that must be free before work is handed to pycolmap, whose threads end the process where they find a full disk:
 #: in any case, for the features of an image, for the matches of a pair (cost: disk space).
 _ROOM, _IMAGE_ROOM, _PAIR_ROOM = 8 << 20, 4 << 20, 1 << 18
-#: Matches per image from which overlap and texture are not what is missing (convention: a word in a message).
+#: Matches per image from which a failure is not one of overlap or texture (convention: a word in a message).
 FEW_MATCHES = 100
 #: Images that a model needs.
 _LEAST_IMAGES = 3

@@ -97,7 +97,7 @@ class Places:
 class WorldFrame:
     """The Cartesian frame that places were brought into."""
 
-    #: What it is, for people, such as ``UTM zone 11 north (EPSG:32611)``.
+    #: Its readable name, such as ``UTM zone 11 north (EPSG:32611)``.
     description: str
     #: The coordinate system; empty for local ones.
     system: str = ""
@@ -161,7 +161,7 @@ def common_frame(groups: Sequence[Places], wanted: str | None = None) -> tuple[l
 
 
 def described(system: str) -> str:
-    """Return the name of a system for people.
+    """Return the readable name of a system.
 
     Raises
     ------

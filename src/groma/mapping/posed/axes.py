@@ -105,7 +105,7 @@ def check_axes(scene: Scene, motions: Motions) -> None:
 
 
 def score(reading: Reading, motions: Motions) -> float:
-    """Return how far motions are off a reading, radians: the mean of rotations and directions, each cut."""
+    """Return the deviation of motions from a reading, radians: the mean of rotations and directions, each truncated."""
     first, second = motions.first, motions.second
     between = reading.rotation[second] @ np.swapaxes(reading.rotation[first], 1, 2)
     off = np.einsum("nij,nij->n", between, quaternion.to_matrix(motions.rotation))

@@ -13,7 +13,7 @@ from groma.evaluation.alignment import camera_centers
 from groma.geometry import quaternion
 from groma.scene import Scene
 
-#: Names in a sentence (convention: what a sentence can hold) (convention: a sentence holds no more).
+#: Names in a sentence (convention: a sentence holds no more).
 _NAMES = 12
 
 

@@ -30,7 +30,7 @@ class SyntheticScene:
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """True landmarks and who sees them."""
+    """True landmarks and the images that see them."""
 
     #: (P, 3), (L, 2, 3) and (K, 4) points, segments and planes.
     xyz: FloatArray

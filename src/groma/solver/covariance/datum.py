@@ -195,7 +195,7 @@ def moves_anything(size: FloatArray, combinations: FloatArray) -> BoolArray:
 def _costs_of_incidences(problem: Problem, motions: dict[str, FloatArray]) -> FloatArray:
     """Return the part of J^T J (7, 7) due to non-zero residuals of invariant factors.
 
-    Landmarks on others cost less in a smaller scene, by what they miss each other: that is no knowledge of its scale.
+    Landmarks on others cost less in a smaller scene, by the distances between them: that does not determine its scale.
     """
     gram = np.zeros((7, 7))
     for factor in problem.factors:

@@ -20,7 +20,7 @@ from groma.solver.linear.contract import LinearSolver, registered_linear_solvers
 
 
 def linear_solver_names() -> tuple[str, ...]:
-    """Return what a linear solver may be called, ``auto`` first."""
+    """Return the names of linear solvers, ``auto`` first."""
     return ("auto", *registered_linear_solvers())
 
 

@@ -35,7 +35,7 @@ from groma.solver.linear.lapack import potrf, potrs
 CLUSTER_SIZE = 24
 #: Cost: time only.
 MAX_CLUSTERS = 64
-#: Fewer clusters than this are not worth it (cost: time only).
+#: Fewer clusters than this are not used (cost: time only).
 MIN_CLUSTERS = 4
 #: Relative addition to the diagonal of the coarse system: a single camera does not determine all seven motions.
 JITTER = 1e-10

@@ -140,7 +140,7 @@ def _line_findings(landmarks: _Landmarks) -> tuple[list[Finding], BoolArray]:
 
 
 def _general_findings(landmarks: _Landmarks, rest: BoolArray) -> list[Finding]:
-    """Name the landmarks that nothing else explains, those that nobody sees, and weak ones."""
+    """Name the landmarks that nothing else explains, those without observations, and weak ones."""
     findings = landmarks.finding(
         f"{landmarks.kind}_unobservable", "problem", rest,
         "is not determined: some of its observations contradict the others, and hardly count under a robust loss",

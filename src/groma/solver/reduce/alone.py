@@ -8,7 +8,7 @@ from groma.execution import available_cores
 
 
 class Alone:
-    """A :class:`groma.solver.reduce.contract.Reducer` that has nobody to ask."""
+    """A :class:`groma.solver.reduce.contract.Reducer` for a single process."""
 
     rank, size, num_neighbours = 0, 1, 1
 

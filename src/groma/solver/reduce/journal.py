@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Where a solve in shards stands, and who keeps it."""
+"""The state of a solve in shards, and the interface of what stores it."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ MAX_STRETCH = 2.0
 
 @dataclass(frozen=True)
 class ShardedSolution:
-    """All variables at their new states, and how they got there."""
+    """All variables at their new states, and the step that led there."""
 
     variables: dict[str, Variables]
     report: SolveReport

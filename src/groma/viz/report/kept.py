@@ -40,7 +40,7 @@ class Kept:
 
 
 def kept(scene: Scene) -> Kept:
-    """Choose what the page holds of a scene."""
+    """Choose the parts of a scene that the page holds."""
     points = thin(scene.num_points, MAX_POINTS)
     pieces = len(line_pieces(scene)[1])
     lines = thin(scene.num_lines, max(1, MAX_LINES * scene.num_lines // max(pieces, 1)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The server of the viewer, and who may connect to it: pages that it has served itself, under a name of this machine.
+"""The server of the viewer; only pages that it served itself, under a name of this machine, may connect to it.
 
 A browser lets every page open a web socket to this machine, and a page can give this machine another name (DNS
 rebinding). Two headers are checked: ``Host`` must be a name or address that the server has, and ``Origin``, where there
