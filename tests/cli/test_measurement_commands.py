@@ -81,6 +81,7 @@ def test_poses_and_what_is_held(folder, tmp_path, capsys, monkeypatch):
         ("--poses {folder}/poses.txt --pose-sigma 1", "must be two positive numbers"),
         ("--hold 99.png", "neither a control point nor an image"),
         ("--hold line:4", "there is no line 4 in the scene"),
+        ("--hold ,", "--hold must be names with commas between them"),
     ],
 )
 def test_what_does_not_fit_is_one_line(folder, tmp_path, capsys, monkeypatch, options, words):

@@ -135,8 +135,8 @@ def _skew4(upper: FloatArray, column: FloatArray) -> FloatArray:
     return out
 
 
-def _unskew4(matrix: FloatArray, name: str) -> tuple[FloatArray, FloatArray]:
-    matrix = matrices(matrix, 4, 4, name)
+def _unskew4(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    matrix = matrices(matrix, 4, 4, "matrix")
     skew = 0.5 * (matrix - np.swapaxes(matrix, -1, -2))
     return skew[..., (2, 0, 1), (1, 2, 0)], skew[..., :3, 3]
 
@@ -174,12 +174,12 @@ def dual_matrix(line: FloatArray) -> FloatArray:
 
 def from_primal_matrix(matrix: FloatArray) -> FloatArray:
     """Plücker vectors (..., 6) of the skew part of primal matrices (..., 4, 4); inverse of :func:`primal_matrix`."""
-    return stack(*_unskew4(matrix, "matrix"))
+    return stack(*_unskew4(matrix))
 
 
 def from_dual_matrix(matrix: FloatArray) -> FloatArray:
     """Plücker vectors (..., 6) of the skew part of dual matrices (..., 4, 4); inverse of :func:`dual_matrix`."""
-    upper, column = _unskew4(matrix, "matrix")
+    upper, column = _unskew4(matrix)
     return stack(column, upper)
 
 

@@ -56,12 +56,12 @@ def guard(command: Callable[P, None]) -> Callable[P, None]:
 def _explain(error: Exception) -> None:
     """Exit with one line if the error is a known one."""
     if isinstance(error, GromaError):
-        _fail(str(error), 1)
+        _fail(str(error))
     if isinstance(error, OSError):
         place = f"{error.filename}: " if error.filename else ""
-        _fail(f"{place}{error.strerror or error}", 1)
+        _fail(f"{place}{error.strerror or error}")
     if isinstance(error, MemoryError):
-        _fail("the memory of this machine is not enough for this input.", 1)
+        _fail("the memory of this machine is not enough for this input.")
 
 
 def _show(message: Warning | str, category: type[Warning], *_where: object) -> None:
@@ -70,9 +70,9 @@ def _show(message: Warning | str, category: type[Warning], *_where: object) -> N
         warn(str(message))
 
 
-def _fail(message: str, code: int) -> None:
+def _fail(message: str) -> None:
     from groma.solver.reduce.mpi import started_as
 
     if started_as()[0] == 0:  # of the ranks of MPI only the first prints
         complain("groma:", " ".join(message.split()), "red")
-    raise typer.Exit(code) from None
+    raise typer.Exit(1) from None

@@ -190,8 +190,8 @@ class Measured:
             plane_sigma=self.plane_sigma,
             pose_sigma=_sigma(self.pose_sigma, "--pose-sigma", (2, 2)),
             mark_sigma_px=self.mark_sigma,
-            check=_names(self.check),
-            hold=_names(self.hold),
+            check=_names(self.check, "--check"),
+            hold=_names(self.hold, "--hold"),
             crs=self.crs,
         )
 
@@ -217,8 +217,11 @@ def _read(reader: Callable[[Path], Any], path: Path | None) -> Any:
     return None if path is None else reader(path)
 
 
-def _names(text: str | None) -> tuple[str, ...]:
-    return tuple(name.strip() for name in (text or "").split(",") if name.strip())
+def _names(text: str | None, option: str) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in (text or "").split(",") if name.strip())
+    if text is not None and not names:
+        raise InputError(f"{option} must be names with commas between them; got {text!r}.")
+    return names
 
 
 def _exif(text: str) -> str | None:

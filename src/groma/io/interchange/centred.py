@@ -75,7 +75,7 @@ def centred_scene(
     total = len(names)
     new_row = np.full(total, -1)
     new_row[posed] = np.arange(len(posed))
-    image = new_row[checked_rows(rows.image_idx, total, "image", path)] if len(rows.image_idx) else rows.image_idx
+    image = new_row[checked_rows(rows.image_idx, total, path)] if len(rows.image_idx) else rows.image_idx
     kept = image >= 0
     shift = np.array([one.size for one in calibrations], float).reshape(-1, 2) / 2
     pixel = rows.pixel[kept] + shift[image[kept]]

@@ -68,11 +68,11 @@ def points_table(ids: Sequence[int] | IntArray, xyz: FloatArray, color: FloatArr
     return Points(numbers, xyz, shades, np.full(len(numbers), -1.0))
 
 
-def checked_rows(index: IntArray, count: int, noun: str, path: object) -> IntArray:
-    """Return references as they are, or raise FileFormatError where one is to nothing."""
+def checked_rows(index: IntArray, count: int, path: object) -> IntArray:
+    """Return references to images as they are, or raise FileFormatError where one is to nothing."""
     if len(index) and (index.min() < 0 or index.max() >= count):
         wrong = int(index[(index < 0) | (index >= count)][0])
-        raise FileFormatError(f"{path}: an observation names {noun} {wrong}, but there are {count} {noun}s.")
+        raise FileFormatError(f"{path}: an observation names image {wrong}, but there are {count} images.")
     return index
 
 
