@@ -53,8 +53,8 @@ from groma.solver.solve import solve
 #: The default for what comes from matching: first a loss that pulls from afar, then one that ignores what stayed far.
 #: Losses by name and scale in pixels; see the page *How to choose* for the measurements behind them.
 ROBUST_STAGES = (("cauchy", 1.0), ("geman_mcclure", 2.0))
-#: Terms that a report counts among the observations, and among the relations.
-COUNTED_OTHERWISE = ("point observations", "line observations", "relations", "relations in pixels")
+#: Terms that a report counts among the observations, and among the relations; and what was not measured.
+COUNTED_OTHERWISE = ("point observations", "line observations", "relations", "relations in pixels", "principal points")
 
 
 @dataclass(frozen=True)
@@ -75,10 +75,11 @@ class AdjustOptions:
     #: Change the model of all cameras first to a more general one: PINHOLE to OPENCV, for example. New parameters start
     #: at zero.
     camera_model: str | None = None
-    #: Estimate focal lengths and distortion; None: for BAL problems, and where ``camera_model`` is given.
+    #: Estimate focal lengths and distortion; None: for BAL problems, where ``camera_model`` is given, and of cameras
+    #: whose calibration was not given (``principal_point_priors`` of the scene).
     refine_intrinsics: bool | None = None
-    #: Estimate principal points too, if intrinsics are refined.
-    refine_principal_point: bool = False
+    #: Estimate principal points too, if intrinsics are refined; None: of cameras whose calibration was not given.
+    refine_principal_point: bool | None = None
     #: Estimate the poses of the cameras on their rigs.
     refine_rigs: bool = False
     #: Which landmarks are used. Without planes, directions and all relations with them are left out too.
@@ -381,8 +382,8 @@ def assembly_options_of(
     is_bal = _is_bal(scene)
     shared = {item.name for item in fields(AssemblyOptions)} & {item.name for item in fields(options)}
     chosen: dict[str, Any] = {name: getattr(options, name) for name in shared}
-    if options.refine_intrinsics is None:
-        chosen["refine_intrinsics"] = is_bal
+    if is_bal and options.refine_intrinsics is None:
+        chosen["refine_intrinsics"] = True
     return AssemblyOptions(**chosen | {"loss": loss, "relation_loss": relation_loss, "drop_behind": not is_bal})
 
 

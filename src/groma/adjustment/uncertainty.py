@@ -116,7 +116,7 @@ def uncertainty(
     check_scene_given(scene)
     if gauge not in ("auto", "inner", "held"):
         raise InputError(f"gauge must be 'auto', 'inner' or 'held'; got {gauge!r}.")
-    options, near = options or AssemblyOptions(), local_frame(scene)
+    options, near = options or AssemblyOptions(refine_intrinsics=None, refine_principal_point=None), local_frame(scene)
     if near is None:
         return _uncertainty(scene, options, gauge, sigma0, problem)
     moved = scene.transformed(near)

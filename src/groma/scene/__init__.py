@@ -5,7 +5,14 @@ from groma.scene.camera import Cameras, Rigs, Sensors
 from groma.scene.image import Frames, Images
 from groma.scene.landmarks import Directions, Lines, Planes, Points
 from groma.scene.line_intervals import LineIntervals
-from groma.scene.measurements import LineDepths, PlaneObservations, PointDepths, PosePriors, RightColumns
+from groma.scene.measurements import (
+    LineDepths,
+    PlaneObservations,
+    PointDepths,
+    PosePriors,
+    PrincipalPointPriors,
+    RightColumns,
+)
 from groma.scene.motions import CameraMotions
 from groma.scene.observations import Keypoints, LineObservations, PointObservations, Relations
 from groma.scene.scene import Scene
@@ -46,6 +53,7 @@ __all__ = [
     "PointObservations",
     "Points",
     "PosePriors",
+    "PrincipalPointPriors",
     "Relations",
     "RightColumns",
     "Rigs",

@@ -14,6 +14,7 @@ all references are checked when it is made. Every change gives a new scene.
     point_depths       -> images, points          right_columns -> point_observations
     plane_observations -> images, planes          line_depths   -> line_observations
     pose_priors        -> frames                  line_intervals -> lines
+    principal_point_priors -> cameras
     camera_motions, camera_positions, camera_poses -> images    marks -> images, control_points
     distances, known_planes, known_directions, held -> any objects
 
@@ -41,7 +42,14 @@ from groma.scene.counts import measurements_of
 from groma.scene.image import Frames, Images
 from groma.scene.landmarks import Directions, Lines, Planes, Points
 from groma.scene.line_intervals import LineIntervals
-from groma.scene.measurements import LineDepths, PlaneObservations, PointDepths, PosePriors, RightColumns
+from groma.scene.measurements import (
+    LineDepths,
+    PlaneObservations,
+    PointDepths,
+    PosePriors,
+    PrincipalPointPriors,
+    RightColumns,
+)
 from groma.scene.motions import CameraMotions
 from groma.scene.observations import Keypoints, LineObservations, PointObservations, Relations
 from groma.scene.similarity import Similarity
@@ -94,6 +102,8 @@ class Scene:
     plane_observations: PlaneObservations = field(default_factory=PlaneObservations)
     #: Poses known beforehand.
     pose_priors: PosePriors = field(default_factory=PosePriors)
+    #: Where principal points are expected, of cameras whose calibration was not given.
+    principal_point_priors: PrincipalPointPriors = field(default_factory=PrincipalPointPriors)
     #: Images that were read row by row, and how their cameras moved meanwhile.
     camera_motions: CameraMotions = field(default_factory=CameraMotions)
     #: Measured places and poses of cameras.

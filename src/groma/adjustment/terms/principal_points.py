@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Principal points of cameras whose calibration was not given.
+
+Lenses are centred to about a hundredth of the longer side of an image: an offset of half of that turns all cameras
+alike by a third of a degree, and bends the path of cameras that look in several directions. With
+
+.. math:: c \sim \mathcal N(\tilde c,\; \sigma_c^2 I)
+
+and :math:`\tilde c` in the middle of the image, the observations move the principal point where they tell it. Where
+they do not, as with a single direction of view, it stays, and what is not known of it is in the covariance of the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from groma._typing import BoolArray
+from groma.adjustment.assembly_options import AssemblyOptions
+from groma.adjustment.terms.contract import Draft, Group, Term
+from groma.cameras import model as camera_model
+from groma.factors.contract import Ref
+from groma.factors.priors.vector_prior import VectorPrior
+from groma.gates import gate
+from groma.scene import PrincipalPointPriors, Scene
+
+
+@dataclass(frozen=True)
+class PrincipalPointGates:
+    """What is known of a lens before its photographs."""
+
+    centred: float = gate(
+        0.01, "share", "of the longer side: standard deviation of an unknown principal point from the middle",
+        "derived from calibrated cameras: 0.5 to 1.2 %; OpenSfM takes the same",
+    )  # fmt: skip
+
+
+GATES = PrincipalPointGates()
+
+
+def near_the_middle(scene: Scene) -> Scene:
+    """Return a scene whose cameras, none of them calibrated, have their principal points near the middle."""
+    cameras = scene.cameras
+    has_one = [len(camera_model(name).principal_point_indices) == 2 for name in cameras.models]
+    size = np.stack([cameras.width, cameras.height], axis=1).astype(np.float64)
+    rows = np.flatnonzero(np.array(has_one, bool) & (size > 0.0).all(axis=1))
+    priors = PrincipalPointPriors(rows, 0.5 * size[rows], GATES.centred * size[rows].max(axis=1, initial=0.0))
+    return scene.replace(principal_point_priors=priors)
+
+
+def estimated_by_prior(scene: Scene, options: AssemblyOptions) -> BoolArray:
+    """Return of which cameras (C,) the principal point is estimated with what is known of it: of those that see."""
+    found = np.zeros(scene.num_cameras, bool)
+    if options.refine_intrinsics is not False and options.refine_principal_point is not False:
+        seen = [table.image_idx for table in (scene.point_observations, scene.line_observations)]
+        found[scene.images.camera_idx[np.concatenate(seen)]] = True
+        found &= np.isin(np.arange(len(found)), scene.principal_point_priors.camera_idx)
+    return found
+
+
+def _factors(draft: Draft) -> Iterator[Group]:
+    table = draft.scene.principal_point_priors
+    estimated = estimated_by_prior(draft.scene, draft.options)[table.camera_idx]
+    for name, members in draft.scene.cameras.by_model().items():
+        rows = np.flatnonzero(estimated & np.isin(table.camera_idx, members))
+        if len(rows):
+            yield Group(
+                VectorPrior(
+                    variable=Ref(f"intrinsics/{name}", np.searchsorted(members, table.camera_idx[rows])),
+                    measured=table.pixel[rows],
+                    coordinates=camera_model(name).principal_point_indices,
+                    sqrt_information=1.0 / table.sigma[rows],
+                )
+            )
+
+
+TERM = Term("principal points", ("principal_point_priors",), (), _factors)
