@@ -170,3 +170,16 @@ def test_leaving_out_landmarks_keeps_what_is_known_without_them():
 def test_a_camera_is_expected_once():
     with pytest.raises(groma.InputError, match="must be unique"):
         PrincipalPointPriors([0, 0], np.zeros((2, 2)), np.ones(2))
+
+
+@pytest.mark.kernels
+def test_a_middle_that_nobody_measured_is_a_guess():
+    _, start, lens = _around(2)
+    bare = start.replace(principal_point_priors=PrincipalPointPriors())
+    found = groma.adjust(bare, groma.AdjustOptions(refine_intrinsics=True, **LEAST_SQUARES)).scene
+    assert found.principal_point_priors.camera_idx.tolist() == [0]
+    assert found.cameras.params[0, 1:3] == pytest.approx(lens[1:3], abs=2.5)
+    measured = bare.with_params(np.add(bare.cameras.params, [[0.0, 1.5, 0.0, 0.0]]))
+    found = groma.adjust(measured, groma.AdjustOptions(refine_intrinsics=True, **LEAST_SQUARES)).scene
+    np.testing.assert_array_equal(found.cameras.params[0, 1:3], measured.cameras.params[0, 1:3])
+    assert len(found.principal_point_priors) == 0

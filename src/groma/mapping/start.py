@@ -72,15 +72,16 @@ def with_fitting_lens(scene: Scene, options: MapOptions) -> Scene:
     """Return a reconstruction with the principal points that suit it, if anything is known of these; and with a second
     coefficient of radial distortion where no model was asked for and the residuals show that it lacks.
     """
+    kept = options.refine_intrinsics is False
     alone = AdjustOptions(
         lines=False,
         planes=False,
         refine_intrinsics=True,
+        refine_principal_point=False if kept else None,
         check_lens=False,
         max_iterations=options.max_iterations,
         threads=options.threads,
     )
-    kept = options.refine_intrinsics is False
     if kept and not _is_unknown(options):
         return scene
     one = adjust(scene, alone)

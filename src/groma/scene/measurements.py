@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What was measured, or is known beforehand, besides the places in the images: depths, stereo pairs, planes, poses.
+"""What was measured besides the places in the images: depths, stereo pairs, planes, poses.
 
 One table for each kind of measurement, one row for each measurement, with its standard deviation. A kind is added by a
 table here, a field of :class:`~groma.scene.Scene` and a term of :mod:`groma.adjustment.terms`; columns declare what
@@ -14,7 +14,7 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.scene.landmarks import check_normals
-from groma.scene.table import Table, check_sigma, check_unique, column
+from groma.scene.table import Table, check_sigma, column
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,14 +88,3 @@ class PosePriors(Table, noun="pose", optional=True):
     rig_from_world: FloatArray = column(np.float64, 7, world="poses")
     #: (N, 6) standard deviations along the axes of the rig (scene units) and about them (radians).
     sigma: FloatArray = column(np.float64, 6, length=(1, 1, 1, 0, 0, 0), check=check_sigma)
-
-
-@dataclass(frozen=True, eq=False)
-class PrincipalPointPriors(Table, noun="principal point", optional=True):
-    """Where principal points are expected, of cameras whose calibration was not given; that is then estimated."""
-
-    #: (N,) the camera, each once.
-    camera_idx: IntArray = column(np.int64, refers="cameras", check=check_unique)
-    #: (N, 2) where its principal point is expected, and the standard deviation of a coordinate, pixels.
-    pixel: FloatArray = column(np.float64, 2)
-    sigma: FloatArray = column(np.float64, check=check_sigma)

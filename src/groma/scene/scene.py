@@ -8,13 +8,12 @@ all references are checked when it is made. Every change gives a new scene.
 ::
 
     rigs <- sensors -> cameras          frames -> rigs
-    images -> cameras, frames, sensors
+    images -> cameras, frames, sensors  principal_point_priors -> cameras
     point_observations -> images, points          keypoints -> images
     line_observations  -> images, lines           relations -> points, lines, planes, directions
     point_depths       -> images, points          right_columns -> point_observations
     plane_observations -> images, planes          line_depths   -> line_observations
     pose_priors        -> frames                  line_intervals -> lines
-    principal_point_priors -> cameras
     camera_motions, camera_positions, camera_poses -> images    marks -> images, control_points
     distances, known_planes, known_directions, held -> any objects
 
@@ -36,20 +35,13 @@ from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion, se3
 from groma.scene import survey
-from groma.scene.camera import Cameras, Rigs, Sensors
+from groma.scene.camera import Cameras, PrincipalPointPriors, Rigs, Sensors
 from groma.scene.checks import check_scene
 from groma.scene.counts import measurements_of
 from groma.scene.image import Frames, Images
 from groma.scene.landmarks import Directions, Lines, Planes, Points
 from groma.scene.line_intervals import LineIntervals
-from groma.scene.measurements import (
-    LineDepths,
-    PlaneObservations,
-    PointDepths,
-    PosePriors,
-    PrincipalPointPriors,
-    RightColumns,
-)
+from groma.scene.measurements import LineDepths, PlaneObservations, PointDepths, PosePriors, RightColumns
 from groma.scene.motions import CameraMotions
 from groma.scene.observations import Keypoints, LineObservations, PointObservations, Relations
 from groma.scene.similarity import Similarity

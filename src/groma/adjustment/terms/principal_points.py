@@ -50,6 +50,21 @@ def near_the_middle(scene: Scene) -> Scene:
     return scene.replace(principal_point_priors=priors)
 
 
+def near_the_middle_if_guessed(scene: Scene, refine_intrinsics: bool | None, refine_it: bool | None) -> Scene:
+    """Return the same where a calibration is to be estimated and begins with principal points exactly in the middle.
+
+    Nobody measured these: programs put them there where nothing is known. Others stay, unless that is said.
+    """
+    if not refine_intrinsics or refine_it is not None or len(scene.principal_point_priors):
+        return scene
+    table = near_the_middle(scene).principal_point_priors
+    rows = [scene.cameras.params_of(row) for row in table.camera_idx.tolist()]
+    models = [camera_model(scene.cameras.models[row]) for row in table.camera_idx.tolist()]
+    begun = [params[list(kind.principal_point_indices)] for params, kind in zip(rows, models, strict=True)]
+    exactly = (np.reshape(begun, (-1, 2)) == table.pixel).all(axis=1)
+    return scene.replace(principal_point_priors=table.take(exactly))
+
+
 def estimated_by_prior(scene: Scene, options: AssemblyOptions) -> BoolArray:
     """Return of which cameras (C,) the principal point is estimated with what is known of it: of those that see."""
     found = np.zeros(scene.num_cameras, bool)

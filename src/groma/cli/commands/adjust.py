@@ -74,7 +74,12 @@ def adjust(
         ),
     ] = None,
     refine_principal_point: Annotated[
-        bool, _options.CAMERAS.option("With the intrinsics: principal points too.", "--refine-principal-point")
+        bool,
+        _options.CAMERAS.option(
+            "With the intrinsics: all principal points too. Default: those exactly in the middle of the image, which "
+            "nobody measured, with what is known of lenses.",
+            "--refine-principal-point",
+        ),
     ] = False,
     refine_rigs: Annotated[
         bool, _options.CAMERAS.option("Estimate the poses of the cameras on their rigs.", "--refine-rigs")
