@@ -157,6 +157,20 @@ def test_one_direction_of_view_leaves_them_where_they_are_expected():
 
 
 @pytest.mark.kernels
+def test_what_is_known_of_lenses_does_not_grow_with_the_noise():
+    _, start, _ = _one_direction(5)
+    found = groma.adjust(start, groma.AdjustOptions(**LEAST_SQUARES))
+    covariances = Covariances(found.problem, gauge="inner", datum={"frames": [1, 1, 1, 0, 0, 0]})
+    stated = np.sqrt(np.trace(covariances.of("frames")[:, 3:, 3:], axis1=1, axis2=2))
+    told = [pose_uncertainty(found.scene, found.problem, sigma0)["rotation_deg"]["median"] for sigma0 in (1.0, 0.01)]
+    assert told[0] == pytest.approx(np.rad2deg(np.median(stated)))
+    assert 0.01 * told[0] < told[1] < 0.5 * told[0]  # the data then tell the principal point
+    small = groma.adjust(start, groma.AdjustOptions(**LEAST_SQUARES | {"point_sigma_px": 0.01 * NOISE}))
+    exact = pose_uncertainty(small.scene, small.problem)["rotation_deg"]["median"]
+    assert told[1] == pytest.approx(exact, rel=0.2)  # elsewhere, as the prior pulls less
+
+
+@pytest.mark.kernels
 def test_leaving_out_landmarks_keeps_what_is_known_without_them():
     _, start, _ = _one_direction(9)
     found = groma.adjust(start, groma.AdjustOptions(**LEAST_SQUARES))

@@ -25,12 +25,12 @@ import numpy as np
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.fit import FIT, noise_of
 from groma.adjustment.pixel_residuals import squared_length
+from groma.adjustment.terms.principal_points import is_prior
 from groma.cameras import CameraModel, in_model
 from groma.cameras import model as camera_model
 from groma.execution import begin
 from groma.factors.contract import Factor, Ref
 from groma.factors.observations.point_reprojection import PointReprojection
-from groma.factors.priors.vector_prior import VectorPrior
 from groma.gates import chi_square_gate, gate
 from groma.geometry.manifold import Euclidean
 from groma.problem.problem import Problem
@@ -202,12 +202,8 @@ def _with_free_lens(problem: Problem, groups: dict[str, CameraModel]) -> Problem
             if free is None or free[:, list(factor.camera.focal_indices)].any():
                 constant[:, list(wider.focal_indices)] = False
             variables[_wide(name)] = Variables(Euclidean(wider.num_parameters, "intrinsics"), state, constant)
-    return Problem(variables, [_in_wider_model(factor, groups) for factor in problem.factors if not _is_prior(factor)])
-
-
-def _is_prior(factor: Factor) -> bool:
-    """Whether it says where principal points are expected, which are held here."""
-    return isinstance(factor, VectorPrior) and factor.variable.group.startswith("intrinsics/")
+    # Principal points are held.
+    return Problem(variables, [_in_wider_model(factor, groups) for factor in problem.factors if not is_prior(factor)])
 
 
 def _in_wider_model(factor: Factor, groups: dict[str, CameraModel]) -> Factor:

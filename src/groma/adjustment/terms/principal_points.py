@@ -13,7 +13,7 @@ they do not, as with a single direction of view, it stays, and what is not known
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,9 +21,10 @@ from groma._typing import BoolArray
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.terms.contract import Draft, Group, Term
 from groma.cameras import model as camera_model
-from groma.factors.contract import Ref
+from groma.factors.contract import Factor, Ref
 from groma.factors.priors.vector_prior import VectorPrior
 from groma.gates import gate
+from groma.problem.problem import Problem
 from groma.scene import PrincipalPointPriors, Scene
 
 
@@ -89,6 +90,21 @@ def _factors(draft: Draft) -> Iterator[Group]:
                     sqrt_information=1.0 / table.sigma[rows],
                 )
             )
+
+
+def is_prior(factor: Factor) -> bool:
+    """Tell whether a factor says where principal points are expected."""
+    return isinstance(factor, VectorPrior) and factor.variable.group.startswith("intrinsics/")
+
+
+def with_principal_points_known_to(problem: Problem, share: float) -> Problem:
+    """Return a problem with the standard deviations of expected principal points multiplied."""
+    if share == 1.0 or not any(map(is_prior, problem.factors)):
+        return problem
+    factors = [
+        replace(one, sqrt_information=one.sqrt_information / share) if is_prior(one) else one for one in problem.factors
+    ]
+    return Problem(problem.variables, factors)
 
 
 TERM = Term("principal points", ("principal_point_priors",), (), _factors)
