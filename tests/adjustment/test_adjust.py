@@ -79,7 +79,7 @@ def test_default_is_robust():
     assert center_rmse(adjust(spoiled)) < 0.2 * center_rmse(adjust(spoiled, AdjustOptions(loss="none")))
 
 
-def test_intrinsics_are_recovered_and_the_principal_point_held():
+def test_intrinsics_are_recovered():
     scene = without_relations(holistic(30, seed=4, noise_px=0.2).start)
     params = scene.cameras.params.copy()
     focal = params[0, 0]
@@ -88,7 +88,9 @@ def test_intrinsics_are_recovered_and_the_principal_point_held():
     result = adjust(start, AdjustOptions(loss="none", refine_intrinsics=True))
     after = result.scene.cameras.params[0]
     assert abs(after[0] / focal - 1) < 1e-3
-    np.testing.assert_array_equal(after[-2:], params[0, -2:])
+    np.testing.assert_allclose(after[-2:], params[0, -2:], atol=0.2)  # the middle, which counts as a guess
+    held = adjust(start, AdjustOptions(loss="none", refine_intrinsics=True, refine_principal_point=False))
+    np.testing.assert_array_equal(held.scene.cameras.params[0, -2:], params[0, -2:])
 
 
 def test_lines_under_distortion_use_bearings():

@@ -87,9 +87,13 @@ def test_cameras_are_known_as_well_as_they_come_out():
     assert 0.5 < np.mean(errors) / predicted < 2.0
     assert told[-1]["calibration"] == "all"
     assert describe_pose_uncertainty(told[-1])[0].endswith("; the calibration counts as exact")
-    lens = groma.adjust(noisy, groma.AdjustOptions(loss="none", refine_intrinsics=True)).pose_uncertainty()
+    estimated = groma.AdjustOptions(loss="none", refine_intrinsics=True, refine_principal_point=False)
+    lens = groma.adjust(noisy, estimated).pose_uncertainty()
     assert lens is not None and lens["calibration"] == "part"  # principal points are held
     assert "what is held of the calibration" in describe_pose_uncertainty(lens)[0]
+    whole = groma.adjust(noisy, groma.AdjustOptions(loss="none", refine_intrinsics=True)).pose_uncertainty()
+    assert whole is not None and whole["calibration"] == "none"
+    assert describe_pose_uncertainty(whole)[0].endswith("; errors of the estimated calibration are in them")
     held = groma.adjust(truth, groma.AdjustOptions(refine_poses=False))
     assert held.pose_uncertainty() is None
 

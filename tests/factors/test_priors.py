@@ -19,6 +19,7 @@ from groma.factors.priors.position_prior import PositionPrior
 from groma.factors.priors.similarity_between import SimilarityBetween
 from groma.factors.priors.vector_prior import VectorPrior
 from groma.geometry import se3, sim3
+from groma.geometry.manifold import Euclidean
 
 pytestmark = pytest.mark.kernels
 N = 6
@@ -126,6 +127,17 @@ def test_vector_prior_takes_any_size(rng):
         record, _ = _linearize(factor, (x,), [size])
         np.testing.assert_array_equal(record[:, :, -1], x - measured)
         np.testing.assert_array_equal(record[:, :, :size], np.tile(np.eye(size), (N, 1, 1)))
+
+
+def test_vector_prior_of_some_coordinates(rng):
+    x, measured = rng.normal(size=(N, 4)), rng.normal(size=(N, 2))
+    factor = VectorPrior(variable=EACH, measured=measured, coordinates=(1, 2))
+    record, _ = _linearize(factor, (x,), [4])
+    np.testing.assert_array_equal(record[:, :, -1], x[:, 1:3] - measured)
+    np.testing.assert_array_equal(record[:, :, :4], np.tile(np.eye(4)[1:3], (N, 1, 1)))
+    check_factor(make_example(factor, rng, manifolds={"poses": Euclidean(4)}))
+    with pytest.raises(ShapeError, match="has 2 columns, but the variables of group 'poses' have 1 numbers to know"):
+        _residuals(VectorPrior(variable=EACH, measured=measured, coordinates=(1,)), (x,))
 
 
 def test_poses_far_from_their_prior_keep_their_derivative(rng):

@@ -25,14 +25,25 @@ def _seen_through(distortion: list[float]):
 
 
 def test_a_lens_that_needs_two_coefficients_gets_them():
-    found = with_fitting_lens(_seen_through([-0.25, 0.3]))
+    found = with_fitting_lens(_seen_through([-0.25, 0.3]), MapOptions())
     assert set(found.cameras.models) == {WIDER_LENS}
     assert found.cameras.params[0][3:] == pytest.approx([-0.25, 0.3], abs=0.02)
 
 
 def test_one_that_needs_one_keeps_it():
     scene = _seen_through([-0.1, 0.0])
-    assert with_fitting_lens(scene) is scene
+    assert with_fitting_lens(scene, MapOptions(refine_intrinsics=False)) is scene
+    found = with_fitting_lens(scene, MapOptions())
+    assert set(found.cameras.models) == {"SIMPLE_RADIAL"}
+    assert found.cameras.params[0][3] == pytest.approx(-0.1, abs=0.01)
+
+
+def test_steps_are_limited():
+    scene = _seen_through([-0.1, 0.0])
+    told = {"camera_model": "SIMPLE_RADIAL", "refine_intrinsics": True}
+    none, some = (with_fitting_lens(scene, MapOptions(max_iterations=most, **told)) for most in (0, 50))
+    assert none.cameras.params_of(0) == pytest.approx(scene.cameras.params_of(0), abs=1e-9)
+    assert np.abs(some.cameras.params_of(0) - scene.cameras.params_of(0)).max() > 1e-3
 
 
 @pytest.mark.parametrize("said", [{"camera_model": "SIMPLE_RADIAL"}, {"camera_params": (500.0, 320.0, 240.0, 0.0)}])

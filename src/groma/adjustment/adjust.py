@@ -37,6 +37,7 @@ from groma.adjustment.stages import (
 from groma.adjustment.survey.place import settled
 from groma.adjustment.terms.contract import Term
 from groma.adjustment.terms.objects import with_held_states
+from groma.adjustment.terms.principal_points import near_the_middle_if_guessed
 from groma.errors import InputError
 from groma.factors.losses import GemanMcClure, Loss, Trivial
 from groma.factors.losses import loss as make_loss
@@ -53,8 +54,8 @@ from groma.solver.solve import solve
 #: The default for what comes from matching: first a loss that pulls from afar, then one that ignores what stayed far.
 #: Losses by name and scale in pixels; see the page *How to choose* for the measurements behind them.
 ROBUST_STAGES = (("cauchy", 1.0), ("geman_mcclure", 2.0))
-#: Terms that a report counts among the observations, and among the relations.
-COUNTED_OTHERWISE = ("point observations", "line observations", "relations", "relations in pixels")
+#: Terms that a report counts among the observations, and among the relations; and what was not measured.
+COUNTED_OTHERWISE = ("point observations", "line observations", "relations", "relations in pixels", "principal points")
 
 
 @dataclass(frozen=True)
@@ -75,10 +76,10 @@ class AdjustOptions:
     #: Change the model of all cameras first to a more general one: PINHOLE to OPENCV, for example. New parameters start
     #: at zero.
     camera_model: str | None = None
-    #: Estimate focal lengths and distortion; None: for BAL problems, and where ``camera_model`` is given.
+    #: Estimate focal lengths and distortion; None: of BAL problems, with ``camera_model``, and where none was given.
     refine_intrinsics: bool | None = None
-    #: Estimate principal points too, if intrinsics are refined.
-    refine_principal_point: bool = False
+    #: Estimate principal points too, if intrinsics are refined; None: those in the middle, which nobody measured.
+    refine_principal_point: bool | None = None
     #: Estimate the poses of the cameras on their rigs.
     refine_rigs: bool = False
     #: Which landmarks are used. Without planes, directions and all relations with them are left out too.
@@ -162,6 +163,7 @@ def adjust(
     refuse_focal_lengths(scene)
     if options.camera_model is not None:
         scene, options = _in_model(scene, options, options.camera_model, progress)
+    scene = near_the_middle_if_guessed(scene, options.refine_intrinsics, options.refine_principal_point)
     near = local_frame(scene)
     if near is None:
         return _settled(scene, options, progress)
@@ -381,8 +383,8 @@ def assembly_options_of(
     is_bal = _is_bal(scene)
     shared = {item.name for item in fields(AssemblyOptions)} & {item.name for item in fields(options)}
     chosen: dict[str, Any] = {name: getattr(options, name) for name in shared}
-    if options.refine_intrinsics is None:
-        chosen["refine_intrinsics"] = is_bal
+    if is_bal and options.refine_intrinsics is None:
+        chosen["refine_intrinsics"] = True
     return AssemblyOptions(**chosen | {"loss": loss, "relation_loss": relation_loss, "drop_behind": not is_bal})
 
 
@@ -392,8 +394,6 @@ def _rms(squares: FloatArray) -> float:
 
 def _sigma0(squares: dict[str, FloatArray], redundancy: dict[str, FloatArray]) -> float | None:
     """Return the noise that the observations show, in units of the noise that was stated."""
-    joined = [
-        np.concatenate([part[kind] for kind in squares]) if squares else np.zeros(0) for part in (squares, redundancy)
-    ]
+    joined = [np.concatenate([np.zeros(0), *(part[kind] for kind in squares)]) for part in (squares, redundancy)]
     sigma = noise_of(*joined)
     return sigma if np.isfinite(sigma) else None

@@ -29,7 +29,7 @@ from groma.adjustment.terms import (
     plane_observations,
     point_depths,
     points,
-    pose_priors,
+    principal_points,
     relations,
     relations_in_pixels,
     right_columns,
@@ -61,7 +61,8 @@ TERMS: tuple[Term, ...] = (
     plane_observations.TERM,
     relations.TERM,
     relations_in_pixels.TERM,
-    pose_priors.TERM,
+    camera_poses.PRIORS,
+    principal_points.TERM,
     camera_motions.TERM,
     camera_poses.POSITIONS,
     camera_poses.POSES,
@@ -197,16 +198,16 @@ def camera_variables(scene: Scene, options: AssemblyOptions, gauge: BoolArray | 
         variables["sensors"] = Variables(chart, scene.sensors.cam_from_rig, constant)
     if len(scene.camera_motions):
         variables[MOTIONS] = camera_motions.motion_variables(scene, options.refine_poses)
+    by_prior = principal_points.estimated_by_prior(scene, options)
+    free = by_prior if options.refine_intrinsics is None else np.full(len(by_prior), options.refine_intrinsics)
     for name, members in scene.cameras.by_model().items():
         model = camera_model(name)
         state = scene.cameras.params[members, : model.num_parameters]
-        constant: bool | BoolArray = not options.refine_intrinsics
-        known = [*model.known_indices]
+        kept = np.repeat(~free[members, None], model.num_parameters, axis=1)
+        kept[:, model.known_indices] = True
         if not options.refine_principal_point:
-            known += model.principal_point_indices
-        if options.refine_intrinsics and known:
-            constant = np.zeros(state.shape, dtype=bool)
-            constant[:, known] = True
+            kept[:, model.principal_point_indices] |= ~by_prior[members, None]
+        constant: bool | BoolArray = bool(kept.all()) or (kept if kept.any() else False)
         variables[f"intrinsics/{name}"] = Variables(Euclidean(model.num_parameters, "intrinsics"), state, constant)
     return variables
 

@@ -46,10 +46,11 @@ class AssemblyOptions:
     held_frames: BoolArray | None = None
     #: Move the landmarks; otherwise they are held.
     refine_landmarks: bool = True
-    #: Estimate focal lengths and distortion.
-    refine_intrinsics: bool = False
-    #: With the intrinsics: principal points too.
-    refine_principal_point: bool = False
+    #: Estimate focal lengths and distortion; None: of cameras whose calibration was not given, which have a row in
+    #: ``principal_point_priors``.
+    refine_intrinsics: bool | None = False
+    #: With the intrinsics: principal points too; None: of these cameras.
+    refine_principal_point: bool | None = False
     #: Estimate where cameras sit on their rig.
     refine_rigs: bool = False
     #: Estimate the common rotation of the right cameras of stereo pairs, with this prior. None:

@@ -45,7 +45,9 @@ def diagnose_scene(
     if near is not None:
         scene = scene.transformed(near)
         problem = None if problem is None else at_places_of(problem, scene)
-    problem = assemble(scene, options or AssemblyOptions()).problem if problem is None else problem
+    if problem is None:
+        unknown = AssemblyOptions(refine_intrinsics=None, refine_principal_point=None)
+        problem = assemble(scene, options or unknown).problem
     first_image = {int(frame): k for k, frame in reversed(list(enumerate(scene.images.frame_idx)))}
     ids = {"points": scene.points.ids, "lines": scene.lines.ids, "planes": scene.planes.ids}
     ids["directions"] = scene.directions.ids

@@ -14,6 +14,7 @@ from groma.adjustment.assemble import assemble, first_camera_gauge
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.places import at_places_of
 from groma.adjustment.terms.objects import with_held
+from groma.adjustment.terms.principal_points import with_principal_points_known_to
 from groma.errors import InputError, ProblemError
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
@@ -116,7 +117,7 @@ def uncertainty(
     check_scene_given(scene)
     if gauge not in ("auto", "inner", "held"):
         raise InputError(f"gauge must be 'auto', 'inner' or 'held'; got {gauge!r}.")
-    options, near = options or AssemblyOptions(), local_frame(scene)
+    options, near = options or AssemblyOptions(refine_intrinsics=None, refine_principal_point=None), local_frame(scene)
     if near is None:
         return _uncertainty(scene, options, gauge, sigma0, problem)
     moved = scene.transformed(near)
@@ -130,7 +131,7 @@ def _uncertainty(
     scene: Scene, options: AssemblyOptions, gauge: str, sigma0: float, problem: Problem | None
 ) -> SceneUncertainty:
     """Return the covariances of a scene that is near the origin of its world."""
-    gauge, covariances = _covariances(scene, options, gauge, problem)
+    gauge, covariances = _covariances(scene, options, gauge, problem, sigma0)
     problem, factor = covariances.problem, sigma0**2
 
     def coordinates(name: str, size: int, count: int) -> FloatArray:
@@ -186,7 +187,7 @@ def pose_uncertainty(
         scene = scene.transformed(near)
         problem = at_places_of(problem, scene)
     try:
-        gauge, covariances = _covariances(scene, AssemblyOptions(), gauge, problem)
+        gauge, covariances = _covariances(scene, AssemblyOptions(), gauge, problem, 1.0 if by_landmarks else sigma0)
         poses = covariances.of_coordinates("frames") * (1.0 if by_landmarks else sigma0**2)
         factors = _landmark_factors(scene, covariances.problem, gauge) if by_landmarks else None
     except ProblemError as error:
@@ -222,9 +223,12 @@ def _landmark_factors(scene: Scene, problem: Problem, gauge: str) -> FloatArray:
 
 
 def _covariances(
-    scene: Scene, options: AssemblyOptions, gauge: str, problem: Problem | None
+    scene: Scene, options: AssemblyOptions, gauge: str, problem: Problem | None, sigma0: float = 1.0
 ) -> tuple[str, Covariances]:
-    """Return the gauge that was chosen, and the covariances in it."""
+    """Return the gauge that was chosen, and the covariances in it; sigma0 is what they are multiplied by the square of.
+
+    What is known of lenses beforehand does not depend on the noise: it is divided by that square.
+    """
     if gauge == "auto":
         metric = options.planes and len(scene.relations) > 0 and options.structure_form == "metric"
         gauge = (
@@ -239,6 +243,7 @@ def _covariances(
         problem = assemble(scene, replace(options, gauge=held)).problem
     else:
         problem = _in_gauge(problem, scene, "inner" if gauge == "measured" else gauge)
+    problem = with_principal_points_known_to(problem, 1.0 / sigma0)
     if gauge == "measured":
         with suppress(ProblemError):
             return gauge, Covariances(problem)

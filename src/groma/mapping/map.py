@@ -235,6 +235,8 @@ def map_segments(
         noise = begin(partial(landmark_noise, scene, options.structure))
         scene = stages.run(find_planes, scene)
         weighted = dataclasses.replace(weighted, structure_sigma_px=surface_noise_px(scene, options.structure, noise()))
+    if len(scene.principal_point_priors) and options.refine_intrinsics is None and options.refine_poses:
+        weighted = dataclasses.replace(weighted, refine_intrinsics=None)  # of cameras whose calibration was not given
     weights = shared()
     scene = scene.replace(point_observations=weights.point_observations, line_observations=weights.line_observations)
     adjusted = stages.run(adjust_everything, scene, weighted)

@@ -41,7 +41,8 @@ class MapOptions:
     find_planes: bool = True
     #: Move the poses; without, only landmarks are adjusted.
     refine_poses: bool = True
-    #: Estimate focal lengths and distortion too; None: where ``camera_model`` changes the given cameras.
+    #: Estimate focal lengths and distortion too; None: where ``camera_model`` changes the given cameras, and where the
+    #: calibration was not given, then at the start and in the last adjustment, with the principal points.
     refine_intrinsics: bool | None = None
     threads: int | None = None
     #: Most steps of each adjustment (cost: time; most end before).

@@ -117,7 +117,7 @@ class MapResult:
             "warnings": list(self.warnings),
             "estimated": {
                 "poses": self.adjusted_with.refine_poses,
-                "intrinsics": bool(self.adjusted_with.refine_intrinsics),
+                "intrinsics": self.adjusted_with.refine_intrinsics is not False,
             },
             "diagnosis": None if diagnosis is None else diagnosis.to_dict(),
             "pose_uncertainty": None if diagnosis is None else self.pose_uncertainty(),

@@ -2,7 +2,8 @@
 """The first stage of a map: poses and points, given, reconstructed from photographs, or found at given poses.
 
 Where nothing is known of the cameras, their distortion is estimated with one coefficient first, which is what few
-photographs determine; where the residuals show that the lens needs a second one, it gets it.
+photographs determine; where the residuals show that the lens needs a second one, it gets it. Their principal points are
+near the middle of the image, and estimated with that (:mod:`groma.adjustment.terms.principal_points`).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from pathlib import Path
 
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.misfit.lens import unmodelled_distortion
+from groma.adjustment.terms.principal_points import near_the_middle
 from groma.io.colmap.sfm import reconstruct_points
 from groma.mapping.checkpoint_files import PLACED, SCENE
 from groma.mapping.checkpoints import Stages, stage
@@ -46,7 +48,7 @@ def start_of(folder: Path, names: list[str], model: Scene | None, stages: Stages
     return PlacedPhotographs(scene, (LENS_NOTE,) if widened else ())
 
 
-@stage("model", SCENE, lambda options: options.point_model(threads=False))
+@stage("model", SCENE, lambda o: (o.point_model(threads=False), o.refine_intrinsics, o.max_iterations))
 def find_start(
     folder: Path,
     names: list[str],
@@ -59,15 +61,33 @@ def find_start(
     if model is not None:
         return model
     found = reconstruct_points(folder, place("sfm"), names, options.point_model(), say)
-    return with_fitting_lens(found, options.threads) if _is_unknown(options) else found
+    if options.point_model().is_partly_calibrated:
+        return found
+    if options.refine_intrinsics is not False:
+        found = near_the_middle(found)
+    return with_fitting_lens(found, options)
 
 
-def with_fitting_lens(scene: Scene, threads: int | None = None) -> Scene:
-    """Return a reconstruction with a second coefficient of radial distortion where its residuals show that it lacks."""
-    alone = AdjustOptions(lines=False, planes=False, refine_intrinsics=True, check_lens=False, threads=threads)
-    one = adjust(scene, alone)
-    if one.problem is None or unmodelled_distortion(one.problem, threads, wider={SIMPLE_LENS: WIDER_LENS}) is None:
+def with_fitting_lens(scene: Scene, options: MapOptions) -> Scene:
+    """Return a reconstruction with the principal points that suit it, if anything is known of these; and with a second
+    coefficient of radial distortion where no model was asked for and the residuals show that it lacks.
+    """
+    kept = options.refine_intrinsics is False
+    alone = AdjustOptions(
+        lines=False,
+        planes=False,
+        refine_intrinsics=True,
+        refine_principal_point=False if kept else None,
+        check_lens=False,
+        max_iterations=options.max_iterations,
+        threads=options.threads,
+    )
+    if kept and not _is_unknown(options):
         return scene
+    one = adjust(scene, alone)
+    wider = {SIMPLE_LENS: WIDER_LENS} if _is_unknown(options) else {}
+    if not wider or one.problem is None or unmodelled_distortion(one.problem, options.threads, wider=wider) is None:
+        return scene if kept else one.scene
     return adjust(one.scene.replace(cameras=one.scene.cameras.with_model(WIDER_LENS)), alone).scene
 
 
@@ -76,10 +96,14 @@ def _is_unknown(options: MapOptions) -> bool:
     return options.camera_model is None and not options.point_model().is_calibrated
 
 
-@stage("placed", PLACED, lambda o: (o.point_model(threads=False), o.refine_poses, o.refine_intrinsics))
+@stage(
+    "placed",
+    PLACED,
+    lambda o: (o.point_model(threads=False), o.refine_poses, o.refine_intrinsics, o.max_iterations),
+)
 def place_at_poses(
     folder: Path, given: Scene, place: Callable[[str], Path], options: MapOptions, say: StageProgress
 ) -> PlacedPhotographs:
     """Points at given poses, and what these are worth."""
-    refine = (options.refine_poses, bool(options.refine_intrinsics))
-    return place_photographs(folder, place("sfm"), given, options.point_model(), *refine, say)
+    how = (options.refine_poses, bool(options.refine_intrinsics), options.max_iterations)
+    return place_photographs(folder, place("sfm"), given, options.point_model(), *how, say)

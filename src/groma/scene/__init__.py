@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Scenes: tables of arrays and identifiers, without algorithms."""
 
-from groma.scene.camera import Cameras, Rigs, Sensors
+from groma.scene.camera import Cameras, PrincipalPointPriors, Rigs, Sensors
 from groma.scene.image import Frames, Images
 from groma.scene.landmarks import Directions, Lines, Planes, Points
 from groma.scene.line_intervals import LineIntervals
@@ -46,6 +46,7 @@ __all__ = [
     "PointObservations",
     "Points",
     "PosePriors",
+    "PrincipalPointPriors",
     "Relations",
     "RightColumns",
     "Rigs",

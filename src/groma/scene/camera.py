@@ -12,7 +12,7 @@ import numpy.typing as npt
 from groma import cameras as camera_models
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
-from groma.scene.table import Table, check_unique, column, text_column
+from groma.scene.table import Table, check_sigma, check_unique, column, text_column
 
 #: Kinds of sensors in a rig.
 CAMERA, OTHER = 0, 1
@@ -102,6 +102,17 @@ class Cameras(Table, noun="camera"):
     def params_of(self, camera_idx: int) -> FloatArray:
         """Return the parameters of one camera, without padding."""
         return self.params[camera_idx, : self.num_params[camera_idx]].copy()
+
+
+@dataclass(frozen=True, eq=False)
+class PrincipalPointPriors(Table, noun="principal point", optional=True):
+    """Where principal points are expected, of cameras whose calibration was not given; that is then estimated."""
+
+    #: (N,) the camera, each once.
+    camera_idx: IntArray = column(np.int64, refers="cameras", check=check_unique)
+    #: (N, 2) where its principal point is expected, and the standard deviation of a coordinate, pixels.
+    pixel: FloatArray = column(np.float64, 2)
+    sigma: FloatArray = column(np.float64, check=check_sigma)
 
 
 @dataclass(frozen=True, eq=False)

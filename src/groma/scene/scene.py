@@ -8,7 +8,7 @@ all references are checked when it is made. Every change gives a new scene.
 ::
 
     rigs <- sensors -> cameras          frames -> rigs
-    images -> cameras, frames, sensors
+    images -> cameras, frames, sensors  principal_point_priors -> cameras
     point_observations -> images, points          keypoints -> images
     line_observations  -> images, lines           relations -> points, lines, planes, directions
     point_depths       -> images, points          right_columns -> point_observations
@@ -35,7 +35,7 @@ from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion, se3
 from groma.scene import survey
-from groma.scene.camera import Cameras, Rigs, Sensors
+from groma.scene.camera import Cameras, PrincipalPointPriors, Rigs, Sensors
 from groma.scene.counts import measurements_of
 from groma.scene.image import Frames, Images
 from groma.scene.landmarks import Directions, Lines, Planes, Points
@@ -94,6 +94,8 @@ class Scene:
     plane_observations: PlaneObservations = field(default_factory=PlaneObservations)
     #: Poses known beforehand.
     pose_priors: PosePriors = field(default_factory=PosePriors)
+    #: Where principal points are expected, of cameras whose calibration was not given.
+    principal_point_priors: PrincipalPointPriors = field(default_factory=PrincipalPointPriors)
     #: Images that were read row by row, and how their cameras moved meanwhile.
     camera_motions: CameraMotions = field(default_factory=CameraMotions)
     #: Measured places and poses of cameras.

@@ -14,7 +14,8 @@ observations depend on each other and whatever their size (the jackknife by grou
 for regressions D. V. Hinkley, *Technometrics*, 1977). With a robust loss the curvature of the cost is smaller than C
 says by the mean of :math:`\psi'/w` (P. J. Huber, *Robust Statistics*, 1981, section 7.6): d is divided by it.
 
-Errors that landmarks share with their neighbours, of a lens for example, are not contained.
+What is known of the cameras without landmarks, such as where a principal point is expected, adds what its standard
+deviation says. Errors that landmarks share with their neighbours, of a lens for example, are not contained.
 """
 
 from __future__ import annotations
@@ -109,6 +110,8 @@ def landmark_jackknife(covariances: Covariances) -> tuple[FloatArray, FloatArray
                 summed += moved.T @ moved  # in their order, whoever made them
     share = max(curvature[0] / max(curvature[1], 1e-300), 0.1)
     found = stated @ summed @ stated / share**2
+    if (known := _known_besides(problem, first, size)).any():
+        found += stated @ known @ stated
     at = first["frames"] + sizes["frames"] * np.arange(len(problem.variables["frames"]))[:, None] + np.arange(6)
     frames = problem.variables["frames"]
     basis = frames.manifold.basis(frames.state)
@@ -116,6 +119,23 @@ def landmark_jackknife(covariances: Covariances) -> tuple[FloatArray, FloatArray
     if basis is not None:
         blocks = [basis @ block @ np.swapaxes(basis, 1, 2) for block in blocks]
     return blocks[0], blocks[1]
+
+
+def _known_besides(problem: Problem, first: dict[str, int], size: int) -> FloatArray:
+    """Return the information (U, U) that factors without a landmark have of the unknowns of cameras."""
+    found = np.zeros((size, size))
+    for factor in problem.factors:
+        references = factor.references()
+        if len(factor) and all(ref.group in first for _, ref in references):
+            blocks, whiten = jacobians_of(factor, problem.variables), root_matrices(factor)
+            J = np.concatenate([whiten @ blocks[slot.name] for slot, _ in references], axis=2)
+            sizes = [blocks[slot.name].shape[2] for slot, _ in references]
+            parts = zip(references, sizes, strict=True)
+            columns = np.hstack(
+                [first[ref.group] + dof * ref.index[:, None] + np.arange(dof) for (_, ref), dof in parts]
+            )
+            np.add.at(found, (columns[:, :, None], columns[:, None, :]), np.swapaxes(J, 1, 2) @ J)
+    return found
 
 
 def _rows_of(factor: Factor, kind: str, problem: Problem, first: dict[str, int], curvature: FloatArray) -> _Rows | None:

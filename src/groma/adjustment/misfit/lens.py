@@ -25,6 +25,7 @@ import numpy as np
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.fit import FIT, noise_of
 from groma.adjustment.pixel_residuals import squared_length
+from groma.adjustment.terms.principal_points import is_prior
 from groma.cameras import CameraModel, in_model
 from groma.cameras import model as camera_model
 from groma.execution import begin
@@ -201,7 +202,8 @@ def _with_free_lens(problem: Problem, groups: dict[str, CameraModel]) -> Problem
             if free is None or free[:, list(factor.camera.focal_indices)].any():
                 constant[:, list(wider.focal_indices)] = False
             variables[_wide(name)] = Variables(Euclidean(wider.num_parameters, "intrinsics"), state, constant)
-    return Problem(variables, [_in_wider_model(factor, groups) for factor in problem.factors])
+    # Principal points are held.
+    return Problem(variables, [_in_wider_model(factor, groups) for factor in problem.factors if not is_prior(factor)])
 
 
 def _in_wider_model(factor: Factor, groups: dict[str, CameraModel]) -> Factor:

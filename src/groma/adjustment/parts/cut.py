@@ -29,8 +29,8 @@ PART_NAMES = "part-*.npz"
 SHARED = ("cameras", "rigs", "sensors", "frames", "images", "planes", "directions")
 #: Tables that are in the first part alone.
 ONCE = (
-    "keypoints", "plane_observations", "pose_priors", "camera_positions", "camera_poses", "control_points", "marks",
-    "distances", "known_planes", "known_directions", "held",
+    "keypoints", "plane_observations", "pose_priors", "principal_point_priors", "camera_positions", "camera_poses",
+    "control_points", "marks", "distances", "known_planes", "known_directions", "held",
 )  # fmt: skip
 
 

@@ -26,7 +26,6 @@ from groma.adjustment.terms import (
     control_points,
     distances,
     known_geometry,
-    pose_priors,
 )
 from groma.adjustment.terms.contract import Draft
 from groma.factors.contract import Factor
@@ -49,7 +48,7 @@ _UNKNOWN = 1e-13
 _ROUNDING = 1e-12
 #: Terms whose measurements notice where the scene is.
 _TERMS = (
-    pose_priors.TERM, camera_poses.POSITIONS, camera_poses.POSES, control_points.CONTROL, distances.TERM,
+    camera_poses.PRIORS, camera_poses.POSITIONS, camera_poses.POSES, control_points.CONTROL, distances.TERM,
     known_geometry.PLANES, known_geometry.DIRECTIONS,
 )  # fmt: skip
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Measured places of camera centres, and measured poses of cameras with their covariance.
+r"""Measured places of camera centres, measured poses of cameras with their covariance, and frames known beforehand.
 
 On rigs the pose of the rig is compared, the camera being held where it is on its rig at the start. A small error
 :math:`\xi` of the camera's pose is :math:`\mathrm{Ad}(T_{bc})\,\xi` of that of its rig.
@@ -45,5 +45,17 @@ def _positions(draft: Draft) -> Iterator[Group]:
     )
 
 
+def _priors(draft: Draft) -> Iterator[Group]:
+    table = draft.scene.pose_priors
+    yield Group(
+        PosePrior(
+            pose=Ref("frames", table.frame_idx),
+            cam_from_world=table.rig_from_world,
+            sqrt_information=(1.0 / table.sigma)[:, :, None] * np.eye(6),
+        )
+    )
+
+
+PRIORS = Term("pose priors", ("pose_priors",), (), _priors)
 POSITIONS = Term("camera positions", ("camera_positions",), (), _positions)
 POSES = Term("camera poses", ("camera_poses",), (), _poses)

@@ -113,7 +113,7 @@ def _sines(draft: Draft, rays: _Rays, sigma: FloatArray) -> Group:
     both = rays.pixels.ndim == 2
     pixels = rays.pixels[:, :, None] * np.eye(2) if both else rays.pixels
     image_idx, line_idx = table.image_idx[rays.rows], table.line_idx[rays.rows]
-    follows = draft.options.refine_intrinsics and len(rays.rows) > 0
+    follows = len(rays.rows) > 0 and not draft.variables[f"intrinsics/{rays.model}"].is_constant
     if follows and camera_model(rays.model).is_planar:
         focal = camera_model(rays.model).focal_length(draft.params(rays.model, image_idx))
         pixels = pixels / (focal[:, None, None] if both else focal)
@@ -141,7 +141,7 @@ def _places(draft: Draft, rows: IntArray) -> tuple[FloatArray, FloatArray]:
 
 def _normals(draft: Draft, rays: _Rays, sigma: FloatArray) -> Group:
     scene, table = draft.scene, draft.scene.line_observations
-    if draft.options.refine_intrinsics:
+    if not draft.variables[f"intrinsics/{rays.model}"].is_constant:
         draft.notes.append(
             "With line_residual='normal' segments are rays of the calibration at the start: they hold it, and standard "
             "deviations come out too small. Use endpoints or bearing."

@@ -68,12 +68,18 @@ def adjust(
     refine_intrinsics: Annotated[
         bool | None,
         _options.CAMERAS.option(
-            "Estimate the calibration too. Default: for BAL files and with --camera-model.",
+            "Estimate the calibration too. Default: for BAL files, with --camera-model, and in maps of photographs "
+            "without a known one.",
             "--refine-intrinsics/--fix-intrinsics",
         ),
     ] = None,
     refine_principal_point: Annotated[
-        bool, _options.CAMERAS.option("With the intrinsics: principal points too.", "--refine-principal-point")
+        bool,
+        _options.CAMERAS.option(
+            "With the intrinsics: all principal points too. Default: those exactly in the middle of the image, which "
+            "nobody measured, with what is known of lenses.",
+            "--refine-principal-point",
+        ),
     ] = False,
     refine_rigs: Annotated[
         bool, _options.CAMERAS.option("Estimate the poses of the cameras on their rigs.", "--refine-rigs")
@@ -230,7 +236,7 @@ def adjust(
 
     options = AdjustOptions(**_chosen(
         loss=loss, loss_scale=loss_scale, camera_model=camera_model, refine_intrinsics=refine_intrinsics,
-        refine_principal_point=refine_principal_point, refine_rigs=refine_rigs, points=points, lines=lines,
+        refine_principal_point=refine_principal_point or None, refine_rigs=refine_rigs, points=points, lines=lines,
         planes=planes, max_iterations=max_iterations, linear_solver=linear_solver, line_chart=line_chart, gauge=gauge,
         line_residual=line_residual, plane_residual=plane_residual, threads=console.threads,
     ))  # fmt: skip

@@ -124,7 +124,7 @@ def map_(
     refine_intrinsics: Annotated[
         bool | None,
         _options.ADJUSTMENT.option(
-            "Estimate the calibration too. Default: where --camera-model changes it.",
+            "Estimate the calibration too. Default: where --camera-model changes it, and where none is known.",
             "--refine-intrinsics/--fix-intrinsics",
         ),
     ] = None,

@@ -124,7 +124,8 @@ def _work_of(scene: Scene, options: AdjustOptions) -> str:
     models = scene.cameras.models if options.camera_model is None else (options.camera_model,)
     estimated = options.refine_intrinsics
     if estimated is None:
-        estimated = options.camera_model is not None or "BAL" in models
+        unknown = len(scene.principal_point_priors) > 0
+        estimated = unknown or options.camera_model is not None or "BAL" in models
     has_points_alone = not (scene.num_lines or scene.num_planes or any(scene.num_measurements.values()))
     return adjusting(models, estimated, has_points_alone)
 

@@ -34,7 +34,7 @@ _GAUGES = {
 _EXACT = {
     "all": "; the calibration counts as exact",
     "part": "; what is held of the calibration counts as exact",
-    "none": "",
+    "none": "; errors of the estimated calibration are in them",
 }
 #: Times in reports that are not of one stage.
 _NO_STAGES = ("total", "compilation")

@@ -3,8 +3,8 @@ r"""Numbers are known: a surveyed point, the intrinsics of a calibration.
 
 .. math:: r = x - \tilde x, \qquad \frac{\partial r}{\partial x} = I
 
-for any variable that moves by addition (a point, intrinsics, a vector). For poses there are
-:mod:`groma.factors.priors.pose_prior` and :mod:`groma.factors.priors.position_prior`.
+for any variable that moves by addition (a point, intrinsics, a vector), or for some of its coordinates. For poses there
+are :mod:`groma.factors.priors.pose_prior` and :mod:`groma.factors.priors.position_prior`.
 """
 
 from __future__ import annotations
@@ -28,8 +28,10 @@ class VectorPrior(Factor):
 
     #: The variables.
     variable: Ref
-    #: (N, k) measured values, k being the size of the variables.
+    #: (N, k) measured values, k being the size of the variables, or the number of ``coordinates``.
     measured: FloatArray
+    #: Which of their numbers are known; None: all.
+    coordinates: tuple[int, ...] | None = None
 
     slots: ClassVar[tuple[Slot, ...]] = (Slot("variable", "vector"),)
     invariance: ClassVar[Invariance] = WORLD_FIXED
@@ -47,21 +49,27 @@ class VectorPrior(Factor):
         return self.measured.shape[1]
 
     def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:  # noqa: D102
-        if ambients[0].shape[1] != self.residual_size:
+        size = ambients[0].shape[1]
+        known = np.arange(size)[slice(None) if self.coordinates is None else list(self.coordinates)]
+        if len(known) != self.residual_size:
             raise ShapeError(
                 f"VectorPrior.measured has {self.residual_size} columns, but the variables of group "
-                f"{self.variable.group!r} have {ambients[0].shape[1]} numbers. Pass one value for each number."
+                f"{self.variable.group!r} have {len(known)} numbers{'' if self.coordinates is None else ' to know'}. "
+                "Pass one value for each number."
             )
-        return ambients
+        return ambients[0], np.eye(size)[known]
 
     def residuals(self, inputs: tuple[Any, ...], begin: int, end: int, out: FloatArray) -> int:  # noqa: D102
-        np.subtract(inputs[0][self.variable.index[begin:end]], self.measured[begin:end], out=out)
+        values = inputs[0][self.variable.index[begin:end]]
+        if self.coordinates is not None:
+            values = values[:, list(self.coordinates)]
+        np.subtract(values, self.measured[begin:end], out=out)
         return 0
 
     def linearize(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         self.residuals(inputs, begin, end, record[:, :, -1])
         if columns[0] >= 0:
-            record[:, :, columns[0] : columns[0] + self.residual_size] = np.eye(self.residual_size)
+            record[:, :, columns[0] : columns[0] + inputs[1].shape[1]] = inputs[1]
         return 0
 
     @classmethod

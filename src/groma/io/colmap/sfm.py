@@ -91,10 +91,18 @@ class PointModelOptions:
     @property
     def is_calibrated(self) -> bool:
         """Whether the calibration of all cameras is known, and kept."""
-        cameras = [camera for rig in self.rigs for camera in rig.cameras]
-        return self.camera_params is not None or (
-            bool(cameras) and all(camera.camera_params is not None for camera in cameras)
-        )
+        return bool(self._calibrated) and all(self._calibrated)
+
+    @property
+    def is_partly_calibrated(self) -> bool:
+        """Whether the calibration of some camera is known, and kept."""
+        return any(self._calibrated)
+
+    @property
+    def _calibrated(self) -> list[bool]:
+        if self.camera_params is not None:
+            return [True]
+        return [camera.camera_params is not None for rig in self.rigs for camera in rig.cameras]
 
 
 def reconstruct_points(

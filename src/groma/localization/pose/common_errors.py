@@ -178,7 +178,9 @@ def common_errors(
         line_observations=lines.replace(sigma=lines.sigma * noise[1]),
         relations=Relations(),
     )
-    options = AssemblyOptions(refine_poses=estimated[0], refine_intrinsics=estimated[1], gauge="free")
+    options = AssemblyOptions(
+        refine_poses=estimated[0], refine_intrinsics=estimated[1], refine_principal_point=None, gauge="free"
+    )
     try:
         problem = with_loss(assemble(bare, options).problem, GemanMcClure(STAGES.last_scale))
         datum = {"frames": [1, 1, 1, 0, 0, 0]} if estimated[0] else None

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from groma.adjustment.terms.principal_points import near_the_middle
 from groma.io.colmap.calibrations import cameras_of_photographs
 from groma.io.colmap.sfm import PointModelOptions
 from groma.io.pose_files import read_poses
@@ -58,4 +59,4 @@ def scene_at_poses(images: Path, poses: Path, options: PointModelOptions) -> Giv
             f"{', '.join(f'{one:g}' for one in focal[:4])} pixels (EXIF, or 1.2 times the longer side)."
         )
     scene = Scene.from_images(cameras, found.names, camera_idx, found.cam_from_world)
-    return GivenScene(scene, calibrated, tuple(said))
+    return GivenScene(scene if calibrated else near_the_middle(scene), calibrated, tuple(said))

@@ -36,6 +36,7 @@ from groma.mapping.posed.placed import PlacedPhotographs
 from groma.mapping.posed.sentences import about_gross_errors, about_left_out, about_noise
 from groma.scene import PosePriors, Scene, Similarity
 from groma.scene.local_frame import usual_frame
+from groma.scene.table import new_index_of
 from groma.solver.covariance.marginals import Covariances
 
 Say = Callable[[str, int, int], None]
@@ -87,6 +88,7 @@ def place_photographs(
     options: PointModelOptions,
     refine_poses: bool = True,
     refine_intrinsics: bool = False,
+    max_iterations: int = 50,
     say: Say = lambda doing, done, total: None,
 ) -> PlacedPhotographs:
     """Find points and better poses of photographs.
@@ -105,6 +107,8 @@ def place_photographs(
         Better the poses; else points are placed at them as they are.
     refine_intrinsics : bool
         Estimate the calibration too.
+    max_iterations : int
+        Most steps of each adjustment.
     say : callable
         Called with a name, the number of parts done, and their total.
 
@@ -126,10 +130,18 @@ def place_photographs(
         return _told(photographs.triangulate(scene, GATES.tolerances_px[-1]), None, near)
     found, known = averaged(scene, motions)
     rounds = len(GATES.tolerances_px)
+    how = AdjustOptions(
+        lines=False,
+        planes=False,
+        refine_intrinsics=refine_intrinsics,
+        check_lens=False,
+        max_iterations=max_iterations,
+        threads=options.threads,
+    )
     for number, tolerance in enumerate(GATES.tolerances_px):
         say("placing points at the poses", number, rounds)
         found = _with_missing_placed(photographs, photographs.triangulate(found, tolerance))
-        found, known = _adjusted(found, known, refine_intrinsics, number > 0)
+        found, known = _adjusted(found, known, how, number > 0)
     return _told(found, known, near)
 
 
@@ -168,9 +180,8 @@ def averaged(scene: Scene, motions: Motions) -> tuple[Scene, GivenPoses]:
     return scene.with_poses(new), GivenPoses(poses, place, turn, sigma)
 
 
-def _adjusted(scene: Scene, known: GivenPoses, refine_intrinsics: bool, last: bool) -> tuple[Scene, GivenPoses]:
+def _adjusted(scene: Scene, known: GivenPoses, options: AdjustOptions, last: bool) -> tuple[Scene, GivenPoses]:
     """Return the scene adjusted with the given poses as measurements, and their estimated noise."""
-    options = AdjustOptions(lines=False, planes=False, refine_intrinsics=refine_intrinsics, check_lens=False)
     if last:
         options = replace(options, point_sigma_px=noise_px(scene.replace(pose_priors=PosePriors()), "points"))
     result = adjust(scene.replace(pose_priors=known.priors()), options)
@@ -218,7 +229,9 @@ def _standalone(given: Scene) -> Scene:
     used, camera_idx = np.unique(given.images.camera_idx[order], return_inverse=True)
     cameras = given.cameras.take(used).replace(ids=np.arange(len(used)) + 1)
     names = [given.images.names[row] for row in order]
-    return Scene.from_images(cameras, names, camera_idx, given.cam_from_world[order])
+    priors = given.principal_point_priors.renumbered({"cameras": new_index_of(used, given.num_cameras)})[0]
+    poses = given.cam_from_world[order]
+    return Scene.from_images(cameras, names, camera_idx, poses, principal_point_priors=priors)
 
 
 def _check_motions(motions: Motions, scene: Scene) -> None:
