@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from _renderings import board, to_uint8
 
-from groma.errors import FileFormatError, InputError, ShapeError
+from groma.errors import FileFormatError, InputError, OutputError, ShapeError
 from groma.features import (
     ExternalMatches,
     FlowOptions,
@@ -313,6 +313,26 @@ def test_matches_from_a_file(tmp_path):
     segments = found.segments_of("a.jpg", np.zeros((30, 40), dtype=np.uint8))
     np.testing.assert_array_equal(segments.ends, ends)
     assert len(found.segments_of("c.jpg", np.zeros((30, 40), dtype=np.uint8))) == 0
+
+
+def test_matches_are_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    path, some = tmp_path / "m.npz", ExternalMatches({}, {("a", "b"): LineMatches([[0, 1]], [0.7])})
+    write_matches(path, some)
+    before = path.read_bytes()
+    with pytest.raises(OutputError, match="exists already"):
+        write_matches(path, ExternalMatches({}, {}))
+
+    def full(file, **arrays):
+        file.write_bytes(b"PK")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    with pytest.raises(OutputError, match="No space left"):
+        write_matches(path, some, force=True)
+    assert path.read_bytes() == before and [one.name for one in tmp_path.iterdir()] == ["m.npz"]
+    monkeypatch.undo()
+    write_matches(path, ExternalMatches({}, {}), force=True)
+    assert not read_matches(path).matches
 
 
 @pytest.mark.parametrize(

@@ -298,6 +298,19 @@ def test_image_folder(tmp_path):
         open_sequence(tmp_path, camera="50 50 32 24")
 
 
+@pytest.mark.parametrize(
+    ("levels", "expected"),
+    [([0, 2048, 4095], [0, 128, 255]), ([300, 512, 1023], [75, 128, 255]), ([257, 25700, 65535], [1, 100, 255])],
+)
+def test_images_of_more_than_8_bits(tmp_path, levels, expected):
+    """12 and 10 bits are stored in 16; one scale is for all frames, and another sequence has another."""
+    for number, level in enumerate(levels):
+        image(tmp_path / f"{number}.png", level, dtype=np.uint16)
+    assert values(open_sequence(tmp_path, camera="50 50 32 24")) == expected
+    image(tmp_path / "0.png", 7)  # of 8 bits: others are the exception
+    assert values(open_sequence(tmp_path, camera="50 50 32 24"))[0] == 7
+
+
 def test_times_from_names(tmp_path):
     for name in ("1.50", "1.25"):
         image(tmp_path / "a" / f"{name}.png", 1)

@@ -122,7 +122,21 @@ def test_finished_keyframes_are_on_disk_while_it_runs(tmp_path):
     assert chosen >= 2
     assert read_scene(tmp_path / "work" / "scene.npz").num_images >= 1
     assert len(read_tum(tmp_path / "work" / "trajectory.txt")) >= 1
+    journal.begin_anew()
+    assert [path.name for path in (tmp_path / "work").iterdir()] == ["lock"]
+    journal.close()
     tracker.finish()
+
+
+def test_two_runs_with_one_output_are_refused(sequence, tmp_path):
+    """Before any frame is read, and not only when the second would write."""
+    journal = Journal(tmp_path / "out.work")
+    refused = _run(sequence, "-o", tmp_path / "out", "--camera", CAMERA)
+    assert refused.exit_code == 1 and isinstance(refused.exception, OutputError | SystemExit)
+    with pytest.raises(OutputError, match=rf"Another run \(process {os.getpid()}\) works in"):
+        groma.track(groma.open_sequence(sequence, camera=CAMERA), work=tmp_path / "out.work")
+    journal.close()
+    assert not (tmp_path / "out").exists() and (tmp_path / "out.work").is_dir()
 
 
 def _same_files(first, second):

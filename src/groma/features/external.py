@@ -12,6 +12,8 @@ Nothing is unpickled. Either order of the two images will do when asking for a p
 
 from __future__ import annotations
 
+import os
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groma.bounded.arrays import opened_arrays
-from groma.errors import FileFormatError, GromaError
+from groma.errors import FileFormatError, GromaError, OutputError
 from groma.features.edge_fit import measure_edges
 from groma.features.images import to_gray
 from groma.features.matches import LineMatches
@@ -112,11 +114,34 @@ def _arrays(path: Path) -> dict[str, Any]:
         ) from error
 
 
-def write_matches(path: str | Path, external: ExternalMatches) -> None:
-    """Write segments and matches in the layout :func:`read_matches` reads."""
+def write_matches(path: str | Path, external: ExternalMatches, force: bool = False) -> None:
+    """Write segments and matches in the layout :func:`read_matches` reads, whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        Where the file goes. Its folder must exist.
+    external : ExternalMatches
+        Segments and matches.
+    force : bool
+        Replace what is there. Without it an existing file is refused.
+
+    Raises
+    ------
+    OutputError
+        If something is there and ``force`` is False, or if the file system refuses.
+    """
+    path = Path(path)
+    if not force and (path.exists() or path.is_symlink()):
+        raise OutputError(f"{path} exists already. Pass force=True to replace it, or choose another name.")
     arrays: dict[str, npt.NDArray[np.generic]] = {f"segments|{n}": np.asarray(e) for n, e in external.segments.items()}
     for (first, second), found in external.matches.items():
         arrays[f"matches|{first}|{second}"] = found.pairs
         arrays[f"scores|{first}|{second}"] = found.score
-    with Path(path).open("wb") as file:
-        np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as workshop:
+            draft = Path(workshop) / "draft.npz"
+            np.savez_compressed(draft, **arrays)  # pyright: ignore[reportArgumentType]
+            os.replace(draft, path)
+    except OSError as error:
+        raise OutputError(f"Cannot write {path}: {error.strerror or error}. Choose another place.") from error

@@ -14,6 +14,7 @@ import numpy as np
 from groma.geometry import se3
 from groma.io import write_scene
 from groma.io.trajectories import write_tum
+from groma.mapping.folder_lock import LOCK, lock_folder
 from groma.tracking.map.keyframes import Followed
 
 if TYPE_CHECKING:
@@ -32,18 +33,30 @@ class Journal:
 
     Rows are those of TUM: time, place, quaternion; in ``frames.txt`` the number of the map follows. ``statuses.txt``
     has a row for every frame (time, status, numbers of points, lines and planes that agree, whether it is a keyframe),
-    and ``now.npz`` the latest picture with its tracked features.
+    and ``now.npz`` the latest picture with its tracked features. The folder is locked until the journal is closed.
+
+    Raises
+    ------
+    OutputError
+        If another process works in the folder, or it cannot be made or written.
     """
 
     def __init__(self, folder: Path) -> None:
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        self._folder = folder
+        self._folder, self._lock = folder, lock_folder(folder)
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """Forget what was noted."""
+        for entry in self._folder.iterdir():
+            if entry.is_dir():
+                shutil.rmtree(entry, ignore_errors=True)
+            elif entry.name != LOCK:
+                entry.unlink()
         self._next = self._next_glance = 0.0
 
-    def begun_anew(self) -> Journal:
-        """Return an empty journal in place of this one."""
-        return Journal(self._folder)
+    def close(self) -> None:
+        """Give the folder free for others; what was noted stays."""
+        self._lock.close()
 
     def frame(self, tracked: TrackedFrame, frame: Frame, tracker: Tracker) -> None:
         """Note what became of a frame, its pose if it has one, and now and then the picture."""

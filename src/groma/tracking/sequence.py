@@ -7,6 +7,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -187,6 +188,8 @@ def track(
     ------
     InputError
         If there is no sequence, or no frame of it could be tracked.
+    OutputError
+        If another run works in ``work``, or it cannot be written.
     """
     if isinstance(sequence, (str, os.PathLike)):
         name = name or os.fspath(sequence)
@@ -197,9 +200,10 @@ def track(
     tracker = Tracker(sequence.camera, options, saved=_loaded(earlier, sequence, options, progress))
     frames: list[TrackedFrame] = []
     journal = None if work is None else Journal(Path(work))
-    tracker, completed = _follow(tracker, sequence, frames, progress, journal)
-    progress(TrackProgress("adjusting all keyframes", 0, 1))
-    result = tracker.finish()
+    with nullcontext() if journal is None else closing(journal):
+        tracker, completed = _follow(tracker, sequence, frames, progress, journal)
+        progress(TrackProgress("adjusting all keyframes", 0, 1))
+        result = tracker.finish()
     warnings = [*sequence.warnings, *result.warnings, *_without_pose(frames)]
     if not len(result.trajectory):
         what = "could be tracked" if earlier is None else f"was found in the map {earlier.path}"
@@ -291,7 +295,9 @@ def _follow(
             better = tracker.begun_anew()
             if better is not None:
                 frames.clear()
-                return _follow(better, sequence, frames, progress, None if journal is None else journal.begun_anew())
+                if journal is not None:
+                    journal.begin_anew()
+                return _follow(better, sequence, frames, progress, journal)
     except KeyboardInterrupt:
         return tracker, False
     return tracker, True

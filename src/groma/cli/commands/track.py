@@ -91,11 +91,10 @@ def track(
     camera = camera or line
     refuse_idle(("--line-detector", line_detector != "lsd" and not lines, "with lines"))
 
-    import shutil
-
     from groma.cli.shared.mapping import WRITING
     from groma.features.images import one_opencv_thread
     from groma.io.sequences import open_sequence
+    from groma.mapping.checkpoints import check_free, remove_stages
     from groma.tracking.options import TrackOptions
     from groma.tracking.saved import FrameSource
     from groma.tracking.sequence import TrackProgress
@@ -116,6 +115,7 @@ def track(
     options.make_detector()  # refuses a wrong name now
     console.expect_compilation("track")
     work = _output.work_folder(output)
+    check_free(work)
     console.expect_stages(*(() if map_ is None else ("reading the map",)), *_STAGES, WRITING)
     with console.stages() as stages:
 
@@ -137,7 +137,7 @@ def track(
         unwritten = result.write(output, f"Track of {sequence.absolute().name}", force, pictures or None)
     for sentence in unwritten:
         console.warn(sentence)
-    shutil.rmtree(work, ignore_errors=True)
+    remove_stages(work)
     numbers = result.summary()
     _say(console, numbers)
     console.wrote_page(output)

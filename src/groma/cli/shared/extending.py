@@ -84,8 +84,9 @@ def merge_maps(
 
     console.expect_stages(*DESCRIBING, *DESCRIBING, COMPARING, *_WITH_POINTS, *following)
     merged = _with_progress(console, made, "the descriptions of the maps are kept beside them")
-    for sentence in warnings:
-        console.warn(sentence)
+    for sentence in (*warnings, merged.left_out):
+        if sentence:
+            console.warn(sentence)
     console.say(merged.sentence())
     return merged
 

@@ -27,6 +27,10 @@ from groma.io.trajectories import Trajectory
 
 #: Frames that are read ahead.
 AHEAD = 2
+#: How grey levels are read from files.
+_GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+#: Images of a sequence that tell how many bits its levels have (cost: of reading them).
+_ASKED = 8
 
 
 @dataclass(frozen=True)
@@ -101,9 +105,12 @@ class FileSequence:
     reference: Trajectory | None
     warnings: list[str]
     num_frames: int | None = field(init=False)
+    #: The brightest level of images of 16 bits.
+    full_level: int = field(init=False)
 
     def __post_init__(self) -> None:
         self.num_frames = len(self.entries)
+        self.full_level = full_level(self.entries)
 
     def __len__(self) -> int:
         return len(self.entries)
@@ -122,7 +129,8 @@ class FileSequence:
     def _load(self, entry: Entry) -> tuple[Frame | None, list[str]]:
         remarks: list[str] = []
         preparation, width, height = self.preparation, *self.file_size
-        gray = _image(entry.gray, (height, width), remarks, "the frame is skipped")
+        shape = (height, width)
+        gray = _image(entry.gray, shape, self.full_level, remarks, "the frame is skipped")
         if gray is None:
             return None, remarks
         if preparation.gray is not None:
@@ -133,7 +141,7 @@ class FileSequence:
         if self.kind == "stereo" and entry.right is None:
             remarks.append(f"{entry.gray.name} has no right image.")
         elif self.kind == "stereo" and entry.right is not None:
-            right = _image(entry.right, (height, width), remarks, "the frame comes without")
+            right = _image(entry.right, shape, self.full_level, remarks, "the frame comes without")
             if right is not None and preparation.right is not None:
                 right = preparation.right.gray(right)
         return Frame(entry.timestamp, gray, depth, right, entry.gray.name), remarks
@@ -185,7 +193,7 @@ def read_ahead(load: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any
 def file_size(entries: list[Entry], calibration: Calibration) -> tuple[int, int]:
     """Return width and height that the first readable image has, and refuse a calibration of another size."""
     for entry in entries:
-        image = _decode(entry.gray, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        image = _decode(entry.gray, _GRAY)
         if image is not None:
             size = (image.shape[1], image.shape[0])
             if calibration.size not in (None, (0, 0), size):
@@ -195,6 +203,24 @@ def file_size(entries: list[Entry], calibration: Calibration) -> tuple[int, int]
                 )
             return size
     raise InputError(f"None of the {len(entries)} images can be read, such as {entries[0].gray if entries else 'any'}.")
+
+
+def full_level(entries: list[Entry]) -> int:
+    """Return the brightest level in the format of images of 16 bits: cameras of 10, 12 and 14 are stored in them.
+
+    It is that of the least number of bits that some images fit into; with one for all, brightness stays as it is from
+    frame to frame.
+    """
+    brightest = 0
+    for entry in entries[:: max(1, len(entries) // _ASKED)]:
+        try:
+            image = _decode(entry.gray, _GRAY | cv2.IMREAD_ANYDEPTH)
+        except FileFormatError:
+            continue
+        if image is not None and image.dtype != np.uint16:
+            return 65535
+        brightest = max(brightest, 0 if image is None else int(image.max()))
+    return next(2**bits - 1 for bits in (8, 10, 12, 14, 16) if brightest < 2**bits)
 
 
 def simple_sequence(
@@ -224,9 +250,14 @@ def _decode(path: Path, flags: int) -> npt.NDArray[Any] | None:
         return None
 
 
-def _image(path: Path, shape: tuple[int, int], remarks: list[str], otherwise: str) -> npt.NDArray[np.uint8] | None:
+def _image(
+    path: Path, shape: tuple[int, int], full: int, remarks: list[str], otherwise: str
+) -> npt.NDArray[np.uint8] | None:
+    """Return the grey levels in a file in 8 bits; ``full`` is the brightest level of 16."""
     try:
-        image = _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        image = _decode(path, _GRAY | cv2.IMREAD_ANYDEPTH)
+        if image is not None and image.dtype not in (np.uint8, np.uint16):
+            image = _decode(path, _GRAY)
     except FileFormatError as error:
         remarks.append(f"{path.name}: {error}")
         return None
@@ -238,4 +269,4 @@ def _image(path: Path, shape: tuple[int, int], remarks: list[str], otherwise: st
             f"{path.name} is {image.shape[1]}x{image.shape[0]}, not {shape[1]}x{shape[0]} as the others; {otherwise}."
         )
         return None
-    return image
+    return np.asarray(image if image.dtype == np.uint8 else cv2.convertScaleAbs(image, alpha=255.0 / full), np.uint8)

@@ -22,6 +22,7 @@ from groma.estimators.motion.matches import LandmarkMatches
 from groma.gates import gate
 from groma.geometry.so3 import hat
 from groma.localization.joining.kept_lines import segments_apart, with_lines_of
+from groma.localization.joining.measurements import with_measurements_of
 from groma.localization.localizer import LocalizedImage, Localizer
 from groma.localization.map_images import content_digest
 from groma.localization.map_index import Progress
@@ -69,6 +70,8 @@ class MergedModel:
     num_points: int
     num_lines: int
     num_common: int
+    #: What was measured of the second map and does not hold here, in words; empty if nothing.
+    left_out: str
 
     @property
     def map(self) -> Scene:
@@ -117,17 +120,22 @@ def merged_model(first: Localizer, second: Localizer, folder: Path, kind: Kind, 
     poses = {image: _pose_of(moved, image, one) for image, one in found.items()}
     known = {content_digest(path): row for row, path in enumerate(first.files)}
     digests = [content_digest(path) for path in second.files]
-    fresh = [row for row, digest in enumerate(digests) if digest not in known]
+    is_fresh = np.array([digest not in known for digest in digests])
+    fresh = np.flatnonzero(is_fresh).tolist()
     placed = [_as_placed(moved, row, poses.get(row)) for row in fresh]
     paths = [*first.files, *(second.files[row] for row in fresh)]
     scene = with_photographs(first.scene, first.index, placed, paths, say)
     gather_photographs(folder, dict(zip(scene.images.names, paths, strict=True)))
     place = {row: first.scene.num_images + number for number, row in enumerate(fresh)}
-    called = tuple(scene.images.names[place.get(row, known.get(digest, 0))] for row, digest in enumerate(digests))
+    images = np.array([place.get(row, known.get(digest, 0)) for row, digest in enumerate(digests)])
+    called = tuple(scene.images.names[image] for image in images.tolist())
+    scene, left_out = with_measurements_of(
+        scene, first.scene, second.scene, Similarity.from_array(motion.similarity), images, is_fresh
+    )
     return MergedModel(
         scene, folder, (first.scene, second.scene), (first.scene.images.names, called),
         same_lines[motion.line_inliers], motion, len(matches) - matches.num_lines, matches.num_lines,
-        len(second.files) - len(fresh),
+        len(second.files) - len(fresh), left_out,
     )  # fmt: skip
 
 
