@@ -180,19 +180,22 @@ def held_out(map_: Path, images: Path, truth: Path, align: bool, every: int = 1)
             start = time.process_time()
             found = localizer.localize(path)
             seconds = time.process_time() - start
-            if found.pose.cam_from_world is None or found.pose.center_sigma is None:
-                rows.append((query, found.pose.status, None, None, None, seconds, found.seconds))
+            covariance = found.pose.covariance
+            if found.pose.cam_from_world is None or found.pose.center_sigma is None or covariance is None:
+                rows.append((query, found.pose.status, None, None, None, None, seconds, found.seconds))
                 continue
             here = np.asarray(_matrix(found.pose.cam_from_world) @ np.linalg.inv(moved), np.float64)
             pose = np.concatenate([quaternion.from_matrix(here[None, :3, :3])[0], here[:3, 3]])
             sigma = float(np.linalg.norm(found.pose.center_sigma))
-            rows.append((query, found.pose.status, *_errors(pose, poses[query]), sigma, seconds, found.seconds))
+            way = se3.log(se3.compose(poses[query][None], se3.inverse(pose[None])))[0]
+            square = float(way @ np.linalg.solve(covariance, way)) / 6.0
+            rows.append((query, found.pose.status, *_errors(pose, poses[query]), sigma, square, seconds, found.seconds))
         told[name] = _summary(rows)
     return told
 
 
 def _summary(rows: list[tuple]) -> dict[str, object]:
-    right = np.array([row[2:5] for row in rows if row[1] == "localized"], float).reshape(-1, 3)
+    right = np.array([row[2:6] for row in rows if row[1] == "localized"], float).reshape(-1, 4)
     within = {
         f"{100 * far:g} cm, {angle:g} deg": float(((right[:, 0] <= far) & (right[:, 1] <= angle)).sum() / len(rows))
         for far, angle in LIMITS
@@ -203,10 +206,11 @@ def _summary(rows: list[tuple]) -> dict[str, object]:
             "median m": float(np.median(right[:, 0])), "worst m": float(right[:, 0].max()),
             "median deg": float(np.median(right[:, 1])), "worst deg": float(right[:, 1].max()),
             "median error over stated": float(np.median(right[:, 0] / right[:, 2])),
+            "mean squared error over stated, of six degrees": float(right[:, 3].mean()),
         }  # fmt: skip
-    told["process seconds"] = float(np.median([row[5] for row in rows]))
-    told["milliseconds beside features"] = float(1e3 * np.median([row[6] for row in rows]))
-    told["each"] = [[row[0], row[1], *(None if x is None else round(x, 4) for x in row[2:5])] for row in rows]
+    told["process seconds"] = float(np.median([row[6] for row in rows]))
+    told["milliseconds beside features"] = float(1e3 * np.median([row[7] for row in rows]))
+    told["each"] = [[row[0], row[1], *(None if x is None else round(x, 4) for x in row[2:6])] for row in rows]
     return told
 
 

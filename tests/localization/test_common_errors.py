@@ -11,8 +11,8 @@ from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.terms.principal_points import near_the_middle
 from groma.evaluation.alignment import align_points
 from groma.geometry import quaternion, se3
+from groma.localization.errors.common_errors import GATES, CommonErrors, common_errors
 from groma.localization.pose.camera import QueryCamera
-from groma.localization.pose.common_errors import GATES, CommonErrors, common_errors
 from groma.localization.pose.free_lens import free_lens
 from groma.localization.pose.gates import REFINEMENT
 from groma.localization.pose.hypotheses import max_errors
@@ -46,7 +46,7 @@ class _Map:
         return QueryCamera.of(self.truth.cameras, 0)
 
     def errors(self, **changes) -> CommonErrors | None:
-        return common_errors(self.scene, self.scene, (1.0, 1.0), (True, True), **changes)
+        return common_errors(self.scene, self.scene, (1.0, 1.0), (True, True), **changes)[0]
 
     def in_truth(self, pose):
         """A pose in the world of the truth, by the centres of the map."""
@@ -188,16 +188,17 @@ def _moved(world, step):
 
 
 @pytest.mark.kernels
-def test_maps_that_are_exact_or_too_large_have_none():
+def test_maps_whose_poses_nothing_contradicts_or_that_are_too_large_have_none():
     world = _map(1)
-    assert common_errors(world.scene, world.scene, (1.0, 1.0), (False, False)) is None
+    bare = world.scene.keep(points=[], lines=[])
+    assert common_errors(bare, bare, (1.0, 1.0), (False, False))[0] is None
     assert world.errors(gates=replace(GATES, unknowns=6 * world.scene.num_frames)) is None
 
 
 @pytest.mark.kernels
 def test_exact_calibrations_leave_errors_of_poses():
     world = _map(2)
-    posed = common_errors(world.scene, world.scene, (1.0, 1.0), (True, False))
+    posed, _ = common_errors(world.scene, world.scene, (1.0, 1.0), (True, False))
     both = world.errors()
     assert posed is not None and both is not None
     assert posed.parameters == 0 and both.parameters == 4

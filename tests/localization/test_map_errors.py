@@ -10,10 +10,10 @@ from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.stages import with_loss
 from groma.factors.losses import GemanMcClure
 from groma.geometry import se3
+from groma.localization.errors.left_out import without_image
+from groma.localization.errors.map_errors import SeenByImage, images_compared, shared_errors
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.hypotheses import max_errors
-from groma.localization.pose.left_out import without_image
-from groma.localization.pose.map_errors import SeenByImage, images_compared, shared_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.records import landmark_covariances, motions_of_lines
 from groma.localization.pose.refinement import refine

@@ -66,7 +66,8 @@ class LocalizeOptions:
     #: Minimum segment length, pixels.
     min_segment_length: float = 15.0
     #: Whether poses and calibrations of the map were estimated, so that the covariance of each pose includes their
-    #: errors. None: from the summary of the map; both where there is none.
+    #: errors. Poses that were held are as exact as the points of the map say, calibrations are exact. None: from the
+    #: summary of the map; both where there is none.
     estimated: tuple[bool, bool] | None = None
     #: Thresholds of image retrieval.
     gates: LocalizerGates = field(default_factory=LocalizerGates)

@@ -27,12 +27,13 @@ from groma.errors import GromaError, InputError, OutputError
 from groma.execution import map_work
 from groma.features.matching.descriptor import describe
 from groma.features.segments import Segments
+from groma.geometry import se3
 from groma.io import atomic_output
+from groma.localization.errors.common_errors import CommonErrors, Responses, common_errors
+from groma.localization.errors.map_errors import SeenByImage, images_compared, shared_errors
 from groma.localization.features import Bytes, DescribedPoints, describe_places, find_points
 from groma.localization.matching import lengths_of
 from groma.localization.pose.camera import QueryCamera
-from groma.localization.pose.common_errors import CommonErrors, Responses, common_errors
-from groma.localization.pose.map_errors import SeenByImage, images_compared, shared_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.records import landmark_covariances, residual_squares
 from groma.localization.repeated import Described, unique_points
@@ -43,7 +44,7 @@ from groma.mapping.photographs import read_gray
 from groma.scene import PointObservations, Points, Scene
 
 #: Of the format of the file; another one is built anew.
-_VERSION = 5
+_VERSION = 6
 #: Images that the features of an image are matched with (cost: time).
 _NEIGHBORS = 12
 
@@ -201,7 +202,7 @@ def digest_of(scene: Scene, files: Sequence[Path]) -> str:
 def build_index(
     scene: Scene, files: Sequence[Path], say: Progress, estimated: tuple[bool, bool] = (True, True)
 ) -> MapIndex:
-    """Describe a map; ``estimated`` says whether its poses and its calibrations were, else they are exact.
+    """Describe a map; ``estimated`` says whether its poses and its calibrations were, or were held.
 
     Raises
     ------
@@ -247,28 +248,34 @@ def build_index(
         unique=unique_points(described, begin, _longer_sides(scene), len(made.xyz) + scene.num_points),
     )
     sigma = np.concatenate(sigmas)
-    index = _with_common_errors(scene, index, sigma, (own_noise, line_noise), estimated)
-    seen = [_seen_by(scene, index, image, sigma, line_noise) for image in images_compared(scene.num_images).tolist()]
+    index, difference = _with_common_errors(scene, index, sigma, (own_noise, line_noise), estimated)
+    compared = images_compared(scene.num_images).tolist()
+    seen = [_seen_by(scene, index, image, sigma, line_noise, difference[image]) for image in compared]
     return replace(index, shared_error=shared_errors(seen, partial(say, "comparing images of the map with the rest")))
 
 
 def _with_common_errors(
     scene: Scene, index: MapIndex, sigma: FloatArray, noise: tuple[float, float], estimated: tuple[bool, bool]
-) -> MapIndex:
-    """The index with what is known of errors of poses and calibrations."""
+) -> tuple[MapIndex, FloatArray]:
+    """The index with what is known of errors of poses and calibrations; and (I, 6, 6) by how much more than landmarks
+    make them the poses of its images differ from held ones.
+    """
     image = np.repeat(np.arange(scene.num_images), np.diff(index.begin))
     described = scene.keep(points=[], lines=[], planes=[], directions=[]).replace(
         points=Points.at(index.xyz),
         point_observations=PointObservations.numbered(image, index.point, index.pixel, sigma),
     )
-    found = common_errors(scene, described, noise, estimated)
+    found, by_frame = common_errors(scene, described, noise, estimated)
+    turned = se3.adjoint(scene.sensors.cam_from_rig[scene.images.sensor_idx])
+    difference = turned @ by_frame[scene.images.frame_idx] @ np.swapaxes(turned, 1, 2)
     if found is None:
-        return index
+        return index, difference
     points, lines = found.points, found.lines
-    return replace(
+    told = replace(
         index, common=found.covariance, point_seen=points.seen, point_motion=points.motion, line_seen=lines.seen,
         line_motion=lines.motion,
     )  # fmt: skip
+    return told, difference
 
 
 def _longer_sides(scene: Scene) -> FloatArray:
@@ -276,7 +283,9 @@ def _longer_sides(scene: Scene) -> FloatArray:
     return np.maximum(scene.cameras.width, scene.cameras.height)[scene.images.camera_idx].astype(np.float64)
 
 
-def _seen_by(scene: Scene, index: MapIndex, image: int, sigma: FloatArray, line_noise: float) -> SeenByImage:
+def _seen_by(
+    scene: Scene, index: MapIndex, image: int, sigma: FloatArray, line_noise: float, difference: FloatArray
+) -> SeenByImage:
     """What an image sees of a described map, with the noise (pixels) that landmarks were estimated with."""
     own = slice(index.begin[image], index.begin[image + 1])
     point, table = index.point[own], scene.line_observations
@@ -288,7 +297,7 @@ def _seen_by(scene: Scene, index: MapIndex, image: int, sigma: FloatArray, line_
         sigma[own], line_noise * table.sigma[rows], index.point_covariance[point], index.line_covariance[line],
     )  # fmt: skip
     camera = QueryCamera.of(scene.cameras, int(scene.images.camera_idx[image]))
-    return SeenByImage(camera, matches, scene.cam_from_world[image])
+    return SeenByImage(camera, matches, scene.cam_from_world[image], difference)
 
 
 @dataclass(frozen=True, eq=False)

@@ -92,7 +92,7 @@ class AbsolutePose:
     #: (7,) [qx qy qz qw tx ty tz]; None where none was found.
     cam_from_world: FloatArray | None
     #: (6, 6) of the left twist: shift in scene units, turn in radians, in the axes of the camera, with respect to the
-    #: map. Errors of its poses and calibrations are in it (:mod:`groma.localization.pose.common_errors`).
+    #: map. Errors of its poses and calibrations are in it (:mod:`groma.localization.errors.common_errors`).
     covariance: FloatArray | None
     #: (N,) and (M,) which matches agree.
     point_inliers: BoolArray

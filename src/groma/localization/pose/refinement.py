@@ -17,7 +17,7 @@ the image before it squares them (clustered sandwich),
 
 What is wrong with the map itself, with the poses that its landmarks were found from, is common to all that a cell
 shows, and no number of matches averages it out. Where it is known to be :math:`\tau` radians as seen from the camera
-(:mod:`groma.localization.pose.map_errors`), the covariance grows by
+(:mod:`groma.localization.errors.map_errors`), the covariance grows by
 
 .. math:: \tau^2 \Big( \sum_c \frac{1}{n_c} \sum_{i \in c} \bar J_i^\top \bar J_i \Big)^{-1} ,
 

@@ -4,9 +4,9 @@ r"""How wrong a map is beside the noise of its landmarks: each image is localise
 Landmarks know the noise of the pixels that they were found from. They do not know the errors of poses, lens and depth:
 those are common to the landmarks of a place, so that no number of them averages the error out. The poses of the images
 of the map show it. Each is estimated from what the image sees without its own part in it
-(:mod:`groma.localization.pose.left_out`); :math:`d_i` is how far that is from its pose in the map, :math:`P_i` the
-covariance by noise alone, :math:`C_i` that by an error of one radian which the landmarks of each cell of the image
-share. That error is the :math:`\tau` with which
+(:mod:`groma.localization.errors.left_out`); :math:`d_i` is how far that is from its pose in the map, :math:`P_i` the
+covariance by noise and by errors that held poses are known to have, :math:`C_i` that by an error of one radian which
+the landmarks of each cell of the image share. That error is the :math:`\tau` with which
 
 .. math:: \operatorname{median}_i\; d_i^\top (P_i + \tau^2 C_i)^{-1} d_i
 
@@ -17,7 +17,7 @@ all of a map alike, or bends it slowly, is not seen by this.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -25,9 +25,9 @@ from groma._typing import FloatArray, IntArray
 from groma.execution import map_work
 from groma.gates import gate
 from groma.geometry import se3
+from groma.localization.errors.left_out import without_image
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.hypotheses import max_errors
-from groma.localization.pose.left_out import without_image
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.refinement import refine
 
@@ -54,6 +54,8 @@ class SeenByImage:
     camera: QueryCamera
     matches: Matches
     pose: FloatArray
+    #: (6, 6) covariance of what its pose is known to differ by from that by the others' landmarks, beside their noise.
+    difference: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
 
 
 def images_compared(count: int) -> IntArray:
@@ -94,7 +96,7 @@ def _case(image: SeenByImage) -> _Case | None:
     if not np.isfinite(noise).all():
         return None
     difference = se3.log(se3.compose(image.pose[None], se3.inverse(found.pose[None])))[0]
-    return difference, noise, found.shared_covariance(matches)
+    return difference, noise + image.difference, found.shared_covariance(matches)
 
 
 def _shared_error(cases: Sequence[_Case | None], gates: MapErrorGates) -> float:

@@ -34,9 +34,10 @@ from groma.adjustment.stages import STAGES, with_loss
 from groma.errors import ProblemError
 from groma.factors.losses import GemanMcClure
 from groma.gates import gate
+from groma.localization.errors.held_poses import held_poses
+from groma.localization.errors.views import Views, views_of
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pose_problem import problem_of
-from groma.localization.pose.records import landmark_rows, motions_of_lines, records, times
 from groma.localization.pose.refinement import Refined, landmark_weights, last_scale
 from groma.scene import Relations, Scene
 from groma.solver.covariance.marginals import Covariances
@@ -49,7 +50,6 @@ class CommonErrorGates:
     unknowns: int = gate(
         4000, "unknowns", "of poses and calibrations at most; larger maps are treated as exact", "cost: their square"
     )
-    loss: float = gate(3.0, "sigma", "scale of the Geman-McClure loss of its landmarks", "convention: three sigma")
 
 
 GATES = CommonErrorGates()
@@ -152,8 +152,9 @@ class CommonErrors:
 def common_errors(
     scene: Scene, described: Scene, noise: tuple[float, float], estimated: tuple[bool, bool],
     gates: CommonErrorGates = GATES,
-) -> CommonErrors | None:  # fmt: skip
-    """Return the common errors of a map; None where it has none, or does not determine them, or is too large.
+) -> tuple[CommonErrors | None, FloatArray]:  # fmt: skip
+    """Return the common errors of a map; None where it has none, or does not determine them, or is too large. And (N,
+    6, 6) by how much more than its landmarks make them, poses of its frames differ from held ones.
 
     Parameters
     ----------
@@ -164,13 +165,15 @@ def common_errors(
     noise
         Of its points and lines, in units of what is stated.
     estimated
-        Whether its poses and its calibrations were estimated; else they are exact.
+        Whether its poses and its calibrations were estimated; else calibrations are exact, and poses as exact as its
+        points say.
     gates
         How large it may be.
     """
-    count = max(len(row) for row in _params(scene)) if estimated[1] else 0
-    if not any(estimated) or 6 * scene.num_frames + count * len(scene.cameras) > gates.unknowns:
-        return None
+    frames, count = scene.num_frames, max(len(row) for row in _params(scene)) if estimated[1] else 0
+    beyond = np.zeros((frames, 6, 6))
+    if 6 * frames + count * len(scene.cameras) > gates.unknowns:
+        return None, beyond
     bare = scene.keep(planes=[], directions=[])
     seen, lines = bare.point_observations, bare.line_observations
     bare = bare.replace(
@@ -178,21 +181,32 @@ def common_errors(
         line_observations=lines.replace(sigma=lines.sigma * noise[1]),
         relations=Relations(),
     )
+    try:
+        covariance = _of_estimated(bare, estimated) if any(estimated) else np.zeros((6 * frames, 6 * frames))
+    except ProblemError:
+        return None, beyond
+    points = views_of(described.keep(lines=[], planes=[], directions=[]), "points", count)
+    if not estimated[0]:
+        held = held_poses(described)
+        covariance[: 6 * frames, : 6 * frames] = np.diag(np.tile(np.repeat(held.sigma**2, 3), frames))
+        beyond = held.of_difference
+    if not covariance.any():
+        return None, beyond
+    if estimated[1]:
+        covariance = _padded(covariance, scene, count)
+    lines_of = views_of(bare.keep(points=[]), "lines", count)
+    return CommonErrors(np.nan_to_num(covariance), frames, responses(points), responses(lines_of)), beyond
+
+
+def _of_estimated(scene: Scene, estimated: tuple[bool, bool]) -> FloatArray:
+    """Joint covariance of the poses and calibrations of a scene; zero for those that were held."""
     options = AssemblyOptions(
         refine_poses=estimated[0], refine_intrinsics=estimated[1], refine_principal_point=None, gauge="free"
     )
-    try:
-        problem = with_loss(assemble(bare, options).problem, GemanMcClure(STAGES.last_scale))
-        datum = {"frames": [1, 1, 1, 0, 0, 0]} if estimated[0] else None
-        found = Covariances(problem, "inner" if estimated[0] else "held", datum=datum)
-        covariance = found.joint(_variables(scene, estimated[1]))
-    except ProblemError:
-        return None
-    if estimated[1]:
-        covariance = _padded(covariance, scene, count)
-    parts = [_responses(described.keep(lines=[], planes=[], directions=[]), "points", count)]
-    parts.append(_responses(bare.keep(points=[]), "lines", count))
-    return CommonErrors(np.nan_to_num(covariance), scene.num_frames, *parts)
+    problem = with_loss(assemble(scene, options).problem, GemanMcClure(STAGES.last_scale))
+    datum = {"frames": [1, 1, 1, 0, 0, 0]} if estimated[0] else None
+    found = Covariances(problem, "inner" if estimated[0] else "held", datum=datum)
+    return found.joint(_variables(scene, estimated[1]))
 
 
 def _params(scene: Scene) -> list[FloatArray]:
@@ -227,38 +241,12 @@ def _padded(covariance: FloatArray, scene: Scene, count: int) -> FloatArray:
     return out
 
 
-def _responses(scene: Scene, kind: str, parameters: int) -> Responses:
-    """How the landmarks of one kind follow errors of poses, and of so many parameters of each camera."""
-    size, total = (3 if kind == "points" else 6), len(getattr(scene, kind))
-    options = AssemblyOptions(refine_intrinsics=True, drop_behind=False, point_chart="euclidean", gauge="free")
-    problem = assemble(scene, options).problem
-    free = np.broadcast_to(np.eye(3), (total, 3, 3))
-    if kind == "lines" and total:
-        free = motions_of_lines(problem.variables[kind].ambient()[:total])
-    cameras = {f"intrinsics/{name}": rows for name, rows in scene.cameras.by_model().items()}
-    V, parts = np.zeros((total, free.shape[2], free.shape[2])), []
-    for factor in problem.factors:
-        landmark = landmark_rows(factor, kind)
-        if landmark is None:
-            continue
-        refs = {slot.name: ref for slot, ref in factor.references()}
-        lens = refs.get("intrinsics") if parameters else None
-        count = 0 if lens is None else problem.variables[lens.group].state.shape[1]
-        wanted = {"pose": 6, **({"intrinsics": count} if count else {}), kind[:-1]: size}
-        white = times(factor.sqrt_information, records(problem, factor, wanted))
-        weight = (1.0 + (white[..., -1] ** 2).sum(axis=1) / GATES.loss**2) ** -2
-        J = white[..., 6 + count : -1] @ free[landmark]
-        np.add.at(V, landmark, np.einsum("n,nki,nkj->nij", weight, J, J))
-        by_view = np.zeros((len(factor), free.shape[2], 6 + parameters))
-        by_view[..., : 6 + count] = np.einsum("n,nki,nkj->nij", weight, J, white[..., : 6 + count])
-        camera = np.zeros(len(factor), np.int64) if lens is None else cameras[lens.group][lens.index]
-        parts.append((landmark, refs["pose"].index, camera, by_view))
-    if not parts:
-        return Responses(np.zeros((0, 3), np.int64), np.zeros((0, size, 6 + parameters), np.float32))
-    landmark, frame, camera, by_view = (np.concatenate(part) for part in zip(*parts, strict=True))
-    values = np.linalg.eigvalsh(V)
-    good = (values[:, 0] > 1e-12 * values[:, -1])[landmark]
-    order = np.flatnonzero(good)[np.argsort(landmark[good], kind="stable")]
-    seen = np.column_stack([landmark, frame, camera])[order].astype(np.int64)
-    motion = -free[seen[:, 0]] @ np.linalg.solve(V[seen[:, 0]], by_view[order])
+def responses(views: Views) -> Responses:
+    """Return how landmarks follow errors of the frames and cameras of their views."""
+    information, good = views.determined()
+    order = np.flatnonzero(good)[np.argsort(views.landmark[good], kind="stable")]
+    landmark, by_view = views.landmark[order], np.concatenate([views.by_frame, views.by_camera], axis=2)[order]
+    pulled = np.swapaxes(views.by_landmark[order], 1, 2) @ by_view
+    motion = -views.free[landmark] @ np.linalg.solve(information[landmark], pulled)
+    seen = np.column_stack([landmark, views.frame[order], views.camera[order]]).astype(np.int64)
     return Responses(seen, motion.astype(np.float32))
