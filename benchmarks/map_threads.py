@@ -7,8 +7,9 @@ Runs with one thread and with two alternate, each in a process of its own; the f
 Medians over the rounds. Nothing looks at a run while it goes on.
 
 *Alone* is the processor time of a run with one thread outside of the pieces of work that several threads would share,
-and of what they would begin early: work that nobody can do meanwhile. It holds on a busy machine. If two threads lost
-nothing else they were C / (A + (C - A) / 2) times as fast; so many times is said as the bound.
+and of what they would begin early: work that nobody can do meanwhile. *Two* is when two threads would be through if
+they lost nothing else, by the processor times of all pieces in the order in which they are given out. Both hold on a
+busy machine.
 
 *Serial* is what was lost with two, waiting included. At the beginning of each stage the run asks the system for the
 processor time of the process and for how long each of its threads had to wait for a core. Of a stage of W seconds in
@@ -16,8 +17,8 @@ which threads ran or waited for R seconds in all, at most two at a time, only on
 share that was not waiting is processor time. Two idle cores are needed: on a busy machine a third thread that waits, or
 one that has ended, makes it too low or too high. Waiting is read under ``/proc``; without it is taken as none.
 
-Columns: seconds of processor time and of wall time with one thread, alone, and the largest memory until then, MB; the
-same with two threads, with what was serial.
+Columns: seconds of processor time and of wall time with one thread, alone, with two threads that lose nothing, and the
+largest memory until then, MB; the same with two threads, with what was serial.
 """
 
 import argparse
@@ -28,31 +29,33 @@ import resource
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from contextlib import suppress
-from functools import partial
+from contextlib import contextmanager, suppress
+from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 
 
 def run(images, model, threads):
     """Map, diagnose and write as the command does; return what was used until the beginning of each stage."""
-    marks, waiting, shared = [], {}, Shared()
+    marks, waiting, schedule = [], {}, Schedule()
     gc.set_threshold(50_000)  # as the command does
 
     def mark(stage, *_):
         if not marks or marks[-1]["stage"] != stage:
             waiting.update(waited())
             used = {"wall": time.monotonic(), "cpu": time.process_time(), "waited": sum(waiting.values())}
-            marks.append({"stage": stage, "peak": peak(), "shared": shared.seconds, **used})
+            marks.append({"stage": stage, "peak": peak(), **schedule.until_now(), **used})
 
     mark("imports")
-    if threads == 1:
-        shared.count()
     from groma.cli.app import app  # noqa: F401 - the command line is part of every run
-    from groma.compilation.loading import loading
+    from groma.compilation import loading
     from groma.execution import share_memory, work_with
     from groma.features.images import one_opencv_thread
+
+    if threads == 1:
+        schedule.follow()
     from groma.io import read_scene
     from groma.mapping.map import map_images
     from groma.mapping.options import MapOptions
@@ -62,7 +65,9 @@ def run(images, model, threads):
     one_opencv_thread()
     scene = read_scene(model)
     with tempfile.TemporaryDirectory() as folder, work_with(threads):
-        with loading("map", threads):
+        if threads == 1:
+            schedule.begun(partial(loading.load, "map", threading.Event()))
+        with loading.loading("map", threads):
             result = map_images(images, Path(folder) / "work", scene, MapOptions(threads=threads), mark)
         mark("diagnosis and uncertainty")
         photographs = result.photographs(images)
@@ -75,41 +80,119 @@ def run(images, model, threads):
     return {"marks": marks, "peak": peak(), "lines": result.scene.num_lines, "scene": digest(result.scene)}
 
 
-class Shared:
-    """The processor time of this thread that others would share, in a run that has one alone."""
+class Schedule:
+    """When a run with one thread would end with two that lose nothing, by the processor time of what it does.
+
+    Pieces of work go to whichever of the two is free first. What is begun early goes to the second one, after what it
+    has to do already, and is waited for where its result is asked for; what it has not begun by then is done by the
+    first.
+    """
 
     def __init__(self):
-        self.seconds, self._inside = 0.0, False
+        #: Seconds at which the first is now, and at which the second is free.
+        self.now = self.free = 0.0
+        #: Seconds of what the second could do, and, within what is begun, of what has threads of its own.
+        self.shared = self._divided = 0.0
+        self._clock, self._inside = time.thread_time(), False
 
-    def count(self):
-        """Count from now on; what imports these functions does so afterwards."""
+    def until_now(self):
+        """Return how much time both have taken until now."""
+        self._go_on()
+        return {"two": self.now, "shared": self.shared}
+
+    def follow(self):
+        """Follow what is done from now on; what imports these functions does so afterwards."""
         from groma import execution
 
-        kinds = {"map_work": self._pieces, "map_in_threads": self._pieces, "begin": self._begun, "beside": self._begun}
-        for name, counting in kinds.items():
-            setattr(execution, name, partial(counting, getattr(execution, name)))
+        execution.begin, execution.beside = self.begun, self.beside
+        for name in ("map_work", "map_in_threads"):
+            setattr(execution, name, partial(self._pieces, getattr(execution, name)))
+        from groma.mapping import checkpoints
         from groma.problem.parallel import Workers
 
+        checkpoints.num_threads = lambda: 2  # what would go on beside a stage is done beside it
         share = Workers.map
-        Workers.map = lambda workers, function, tasks, alone=False: share(
-            workers, function if alone or tasks < 2 else partial(self._timed, function), tasks, alone
-        )
 
-    def _begun(self, begin, function):
-        return begin(partial(self._timed, function))
+        def of_workers(workers, function, tasks, alone=False):
+            def work(piece, items):
+                return share(workers, piece, len(items), alone)
+
+            begin = time.thread_time()
+            result = work(function, range(tasks)) if alone else self._pieces(work, function, range(tasks))
+            self._divided += time.thread_time() - begin if self._inside and tasks > 1 and not alone else 0.0
+            return result
+
+        setattr(Workers, "map", of_workers)  # noqa: B010 - another signature
+
+    def begun(self, function):
+        """Do now what is begun now; return what waits for it."""
+        divided, self._divided = self._divided, 0.0
+        result, begin, seconds = self._done_beside(function)
+        share, self._divided = 1.0 - 0.5 * self._divided / max(seconds, 1e-9), divided
+
+        def ask():
+            self._go_on()
+            if not self._inside:
+                left = min(begin + seconds - self.now, seconds)
+                self.now += max(left, 0.0) * share  # the first one helps where it has threads of its own
+            return result
+
+        return cache(ask)
+
+    @contextmanager
+    def beside(self, function):
+        """Do something before the block that two threads would do beside it."""
+        _, begin, seconds = self._done_beside(function)
+        yield
+        self._go_on()
+        self.now = max(self.now, begin + seconds)
+
+    def _done_beside(self, function):
+        """What a function returns, and when the second one would begin it and how long it takes."""
+        result, seconds = self._timed(function)
+        begin = max(self.now, self.free)
+        self.free = begin + seconds
+        return result, begin, seconds
 
     def _pieces(self, work, function, items, *more):
-        return work(function if len(items) < 2 else partial(self._timed, function), items, *more)
+        """Do pieces of work that two would share."""
+        if self._inside or len(items) < 2:
+            return work(function, items, *more)
+        self._go_on()
+        begin, second = self.now, max(self.now, self.free)
+        ends = [begin, second]
 
-    def _timed(self, function, *given):
+        def piece(item):
+            result, seconds = self._timed(partial(function, item))
+            ends[ends.index(min(ends))] += seconds
+            return result
+
+        found = work(piece, items, *more)
+        self._go_on()
+        between = self.now - begin
+        if ends[1] > second:  # it has had some of them
+            self.free = ends[1]
+        self.now = between + (max(ends) if ends[1] > second else ends[0])
+        return found
+
+    def _timed(self, function):
+        """What a function returns, and its processor time, zero within what is timed already."""
         if self._inside:
-            return function(*given)
-        self._inside, begin = True, time.thread_time()
+            return function(), 0.0
+        self._go_on()
+        self._inside, begin = True, self._clock
         try:
-            return function(*given)
+            result = function()
         finally:
-            self._inside = False
-            self.seconds += time.thread_time() - begin
+            self._inside, self._clock = False, time.thread_time()
+        self.shared += self._clock - begin
+        return result, self._clock - begin
+
+    def _go_on(self):
+        """Let the first one's clock go on until now."""
+        if not self._inside:
+            before, self._clock = self._clock, time.thread_time()
+            self.now += self._clock - before
 
 
 def peak():
@@ -138,12 +221,15 @@ def stages_of(marks):
     """Processor time, wall time, serial time and largest memory of each stage of a run."""
     stages = {}
     for before, after in pairwise(marks):
-        entry = stages.setdefault(before["stage"], dict.fromkeys(("cpu", "wall", "waited", "shared", "peak"), 0.0))
-        for name in ("cpu", "wall", "waited", "shared"):
+        entry = stages.setdefault(
+            before["stage"], dict.fromkeys(("cpu", "wall", "waited", "shared", "two", "peak"), 0.0)
+        )
+        for name in ("cpu", "wall", "waited", "shared", "two"):
             entry[name] += after[name] - before[name]
         entry["peak"] = after["peak"]
     stages[marks[0]["stage"]]["cpu"] += marks[0]["cpu"]
     stages[marks[0]["stage"]]["wall"] += marks[0]["cpu"]
+    stages[marks[0]["stage"]]["two"] += marks[0]["cpu"]
     for entry in stages.values():
         entry["alone"] = entry["cpu"] - entry["shared"]
         able = entry["cpu"] + entry["waited"]
@@ -174,9 +260,10 @@ def main():
             for threads, runs in rounds.items():
                 found = alone([*command, str(threads)], bytecode)
                 runs.append((stages_of(found["marks"]), found))
-    names = ("CPU 1", "wall 1", "alone", "MB 1", "CPU 2", "wall 2", "serial", "MB 2")
+    names = ("CPU 1", "wall 1", "alone", "two", "MB 1", "CPU 2", "wall 2", "serial", "MB 2")
     print(f"{'stage':28s} " + " ".join(f"{name:>7s}" for name in names))
-    columns = [(1, "cpu"), (1, "wall"), (1, "alone"), (1, "peak"), (2, "cpu"), (2, "wall"), (2, "serial"), (2, "peak")]
+    columns = [(1, key) for key in ("cpu", "wall", "alone", "two", "peak")]
+    columns += [(2, key) for key in ("cpu", "wall", "serial", "peak")]
     table = {
         stage: [median([run[0].get(stage, {}).get(key, 0.0) for run in rounds[threads]]) for threads, key in columns]
         for stage in rounds[2][0][0]
@@ -185,9 +272,12 @@ def main():
     whole = table["all"] = [of(row[k] for row in table.values()) for k, of in enumerate(several)]
     for stage, row in table.items():
         print(f"{stage:28s} " + " ".join(f"{value:7.2f}" for value in row))
-    share = whole[2] / whole[0]
-    print(f"\nalone {share:.1%}, which allows {2.0 / (1.0 + share):.2f} times as fast; ", end="")
-    print(f"serial {whole[6] / whole[4]:.1%}; ratio of wall times {whole[1] / whole[5]:.2f}")
+    of = dict(zip(names, whole, strict=True))
+    print(
+        f"\nalone {of['alone'] / of['CPU 1']:.1%}; two threads can be {of['CPU 1'] / of['two']:.2f} times as fast; ",
+        end="",
+    )
+    print(f"serial {of['serial'] / of['CPU 2']:.1%}; ratio of wall times {of['wall 1'] / of['wall 2']:.2f}")
     one, two = (median([run[1]["peak"] for run in rounds[threads]]) for threads in (1, 2))
     scenes = {run[1]["scene"] for runs in rounds.values() for run in runs}
     same = "the same bit by bit" if len(scenes) == 1 else "NOT the same"

@@ -31,7 +31,7 @@ def loading(work: str, threads: int | None = None) -> Iterator[None]:
         yield
         return
     is_over = threading.Event()
-    thread = threading.Thread(target=_load, args=(work, is_over), name="groma-load")
+    thread = threading.Thread(target=load, args=(work, is_over), name="groma-load")
     thread.start()
     try:
         yield
@@ -40,8 +40,8 @@ def loading(work: str, threads: int | None = None) -> Iterator[None]:
         thread.join()
 
 
-def _load(work: str, is_over: threading.Event) -> None:
-    """Load one function after the other, as they are listed."""
+def load(work: str, is_over: threading.Event) -> None:
+    """Load one function after the other, as they are listed, until it is over."""
     from numba.core.compiler_lock import global_compiler_lock
     from numba.core.registry import cpu_target
 

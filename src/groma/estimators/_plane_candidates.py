@@ -16,20 +16,20 @@ import numpy as np
 
 from groma._numba import loop
 from groma._ordering import median
-from groma._trees import kd_tree
+from groma._trees import kd_tree, nearest
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators._plane_loops import BALL, height_kernel, least_axis_kernel, lies_on_kernel, variance_kernel
 from groma.estimators._plane_options import PLANE_SEARCH
-from groma.execution import map_in_threads, num_threads
+from groma.execution import map_in_threads
 from groma.geometry.algebra import dot, norm
 
 #: Pairs processed together (cost: memory).
 _CHUNK = 4096
 #: Features, or up to twice as many, by which two planes are compared (cost: time only).
 _JUDGES = 64
-#: Candidates that are worth a thread: one takes a hundredth of a millisecond, and handing over a tenth. And pieces for
-#: each thread, as some candidates take longer than others (cost: time only).
-_SCORED_AT_ONCE, _PIECES = 256, 8
+#: Candidates that are worth a thread: one takes a hundredth of a millisecond, and handing over a tenth. And pieces, as
+#: some candidates take longer than others (cost: time only).
+_SCORED_AT_ONCE, _PIECES = 256, 32
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def features_of(places: FloatArray, noise: FloatArray, partner: IntArray, carrie
     position = np.empty_like(given)
     position[given] = np.arange(len(given))
     places, noise = places[given], noise[given]
-    distance, neighbours = tree.query(places, k=near, workers=num_threads())
+    distance, neighbours = nearest(tree, places, near)
     first = np.arange(0, len(places), BALL)
     number = np.diff(np.append(first, len(places)))
     center = np.add.reduceat(places, first) / number[:, None]
@@ -172,7 +172,7 @@ def from_segments(features: Features, num_points: int, gate: float) -> tuple[Flo
         return np.zeros((0, 4)), np.zeros(0, np.int64), 0
     middle = ends.mean(axis=1)
     count = min(PLANE_SEARCH.near_segments + 1, len(ends))
-    near = np.asarray(kd_tree(middle).query(middle, k=count, workers=num_threads())[1], dtype=np.int64)
+    _, near = nearest(kd_tree(middle), middle, count)
     first, second = np.repeat(np.arange(len(ends)), count - 1), near[:, 1:].ravel()
     keys = np.sort((np.minimum(first, second) * len(ends) + np.maximum(first, second))[first != second])
     once = np.column_stack(np.divmod(keys[np.diff(keys, prepend=-1) > 0], len(ends)))
@@ -316,8 +316,7 @@ class Scores:
     def of(self, which: IntArray, labels: IntArray) -> tuple[IntArray, FloatArray]:
         """Support (M,) and score (M,) of some candidates among the features without a label."""
         features, support, score = self._features, np.empty(len(which), np.int64), np.empty(len(which))
-        threads = num_threads()
-        pieces = max(1, min(_PIECES * threads if threads > 1 else 1, len(which) // _SCORED_AT_ONCE))
+        pieces = max(1, min(_PIECES, len(which) // _SCORED_AT_ONCE))
         cuts = [len(which) * piece // pieces for piece in range(pieces + 1)]
 
         def fill(piece: int) -> None:

@@ -11,7 +11,7 @@ import scipy  # its parts are imported when something of them is first used
 
 from groma._numba import loop
 from groma._ordering import copy, median
-from groma._trees import kd_tree
+from groma._trees import kd_tree, nearest
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators._plane_candidates import Features
 from groma.estimators._plane_loops import (
@@ -280,5 +280,5 @@ def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, pl
         return np.zeros(0, dtype=bool)
     basis = np.stack(perpendicular(plane[:3]), axis=1)
     tree = kd_tree(places @ basis, balanced_tree=False, compact_nodes=False)
-    distance, _ = tree.query(tested @ basis, distance_upper_bound=np.nextafter(GATES.link * spacing.max(), np.inf))
-    return np.asarray(distance <= GATES.link * spacing)
+    distance, _ = nearest(tree, tested @ basis, 1, np.nextafter(GATES.link * spacing.max(), np.inf))
+    return np.asarray(distance[:, 0] <= GATES.link * spacing)

@@ -57,7 +57,7 @@ FIRST_DAMPING, MIN_DAMPING, MAX_ATTEMPTS = 1e-4, 1e-12, 8
 #: A pivot below this fraction of its diagonal entry means a singular system.
 PIVOT_TOLERANCE = 1e-12
 #: Problems, or lines, that one piece of work solves; a problem takes some ten microseconds (cost: time only).
-PROBLEMS_AT_ONCE = 512
+PROBLEMS_AT_ONCE = 128
 
 
 def _frame(kind, x, B):

@@ -56,8 +56,8 @@ from groma.mapping.read_rows import adjust_read_rows, mapped_as_measured, read_b
 from groma.mapping.refine_points import refine_points
 from groma.mapping.result import SCENES_OF_RESULT, MapResult, result_of
 from groma.mapping.start import start_of
-from groma.mapping.structure.find import find_structure
-from groma.mapping.structure.flatness import landmark_noise, surface_noise_px
+from groma.mapping.structure.find import LandmarkNoise, find_structure, landmark_noise
+from groma.mapping.structure.flatness import surface_noise_px
 from groma.mapping.surveyed import adjust_with_survey, tied
 from groma.mapping.with_depths import find_segment_depths, with_depths
 from groma.scene import Scene
@@ -217,10 +217,11 @@ def map_segments(
         given = joint.point_observations.replace(sigma=points.point_observations.sigma)
         joint = with_point_noise(joint.replace(point_observations=given))
         # The lines as mapped are good starts, and only the adjusted ones tell the noise of the segments.
-        weighted = _weighted(joint, options)
+        told = begin(partial(_weighted, joint, options))
         earlier = EarlierMap(before, line_map)
         moved = begin(partial(moved_px, before, joint, GATES.moved_share))
         line_map = stages.run(find_lines_again, joint, segments, matches, neighbors, earlier, tag=tag)
+        weighted = told()
         scene = with_line_depths(line_map.add_to(joint, segments), line_map, segments, depths)
         if scene.num_lines == 0 or moved() <= options.lines.noise:
             break
@@ -232,9 +233,9 @@ def map_segments(
     sigma_px = weighted.point_sigma_px, weighted.line_sigma_px * math.sqrt(1.0 + weighted.line_end_correlation)
     shared = begin(partial(with_shared_noise, scene, *sigma_px))
     if options.find_planes:
-        noise = begin(partial(landmark_noise, scene, options.structure))
-        scene = stages.run(find_planes, scene)
-        weighted = dataclasses.replace(weighted, structure_sigma_px=surface_noise_px(scene, options.structure, noise()))
+        noise = landmark_noise(scene, options.structure)
+        scene = stages.run(find_planes, scene, noise)
+        weighted = dataclasses.replace(weighted, structure_sigma_px=surface_noise_px(scene, options.structure, noise))
     if len(scene.principal_point_priors) and options.refine_intrinsics is None and options.refine_poses:
         weighted = dataclasses.replace(weighted, refine_intrinsics=None)  # of cameras whose calibration was not given
     weights = shared()
@@ -299,9 +300,9 @@ def adjust_jointly(scene: Scene, weighted: AdjustOptions, options: MapOptions, s
 
 
 @stage("structure", SCENE)
-def find_planes(scene: Scene, options: MapOptions, say: StageProgress) -> Scene:
+def find_planes(scene: Scene, noise: LandmarkNoise, options: MapOptions, say: StageProgress) -> Scene:
     """Planes, common directions and structural relations."""
-    return find_structure(scene, options.structure, progress=say)
+    return find_structure(scene, options.structure, progress=say, noise=noise)
 
 
 @stage("adjusted", ADJUSTED)

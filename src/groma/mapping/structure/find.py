@@ -39,6 +39,8 @@ from groma.mapping.structure.rough_planes import on_fitted_planes
 from groma.scene import Directions, Held, Planes, Relations, Scene
 from groma.scene.survey import Kind
 
+#: Of points, and of lines.
+LandmarkNoise = tuple[PointNoise, LineNoise]
 #: Related lines below which a direction is not one that lines share.
 _MIN_PARALLEL = 2
 
@@ -98,6 +100,7 @@ def find_structure(
     options: StructureOptions | None = None,
     candidates: FloatArray | None = None,
     progress: Callable[[str, int, int], None] | None = None,
+    noise: LandmarkNoise | None = None,
 ) -> Scene:
     """Return the scene with planes, directions and relations found in its points and lines.
 
@@ -112,6 +115,8 @@ def find_structure(
         Directions in the world to try for lines, such as vanishing points of images, turned to the world.
     progress : callable, optional
         Called with stage, number done, number in all.
+    noise : optional
+        :func:`landmark_noise` of the scene, where it is known already.
 
     Returns
     -------
@@ -127,7 +132,7 @@ def find_structure(
     -----
     Poses are held. Adjust the scene first: in a distorted reconstruction walls are not planar.
     """
-    return detect_structure(scene, options, candidates, progress).scene
+    return detect_structure(scene, options, candidates, progress, noise).scene
 
 
 def detect_structure(
@@ -135,6 +140,7 @@ def detect_structure(
     options: StructureOptions | None = None,
     candidates: FloatArray | None = None,
     progress: Callable[[str, int, int], None] | None = None,
+    noise: LandmarkNoise | None = None,
 ) -> Structure:
     """Find planes, directions and relations, and return them with covariances and probabilities.
 
@@ -146,10 +152,10 @@ def detect_structure(
     report = progress or (lambda stage, done, total: None)
     level, least, least_line = options.level, options.min_probability, options.min_line_probability
     report("finding planes", 0, 1)
-    marks = _landmarks(scene, options)
-    on_line = on_lines(marks, level, least)
+    marks = _landmarks(scene, options, noise)
     parallels = begin(partial(_parallels, scene, marks, options, candidates))
     meeting = begin(partial(meetings, marks, level, least_line))
+    on_line = on_lines(marks, level, least)
     planes = _planes_in(marks, on_line, options, partial(report, "finding planes"))
     report("finding directions", 0, 1)
     directions, along = parallels()
@@ -249,20 +255,19 @@ def _with_vertical(scene: Scene, vertical: Vector | None, directions: DirectionS
     return scene.replace(directions=Directions(np.arange(len(vectors)) + 1, vectors), held=held)
 
 
-def _landmarks(scene: Scene, options: StructureOptions) -> Landmarks:
+def landmark_noise(scene: Scene, options: StructureOptions) -> LandmarkNoise:
+    """Return the noise of points and of lines, which does not depend on the planes that are found in them."""
+    of_points = partial(point_noise, scene, options.point_sigma_px)
+    return together(of_points, partial(line_noise, scene, options.line_sigma_px))
+
+
+def _landmarks(scene: Scene, options: StructureOptions, noise: LandmarkNoise | None) -> Landmarks:
     """Points and lines with their noise, and which of them may take part."""
-
-    def noise_of_points() -> PointNoise:
-        flat = options.surface_sigma_px * lengths_per_pixel(scene, "point")
-        return point_noise(scene, options.point_sigma_px).widened(flat)
-
-    def noise_of_lines() -> tuple[LineNoise, LineNoise]:
-        own = line_noise(scene, options.line_sigma_px)
-        return own.widened(options.surface_sigma_px * lengths_per_pixel(scene, "line")), own.by_misfit()
-
-    points, (lines, own), (point_spacing, end_spacing) = together(
-        noise_of_points, noise_of_lines, partial(spacings, scene.points.xyz, scene.lines.segments)
-    )
+    points, own = noise or landmark_noise(scene, options)
+    point_pixel, line_pixel = lengths_per_pixel(scene, "point"), lengths_per_pixel(scene, "line")
+    points = points.widened(options.surface_sigma_px * point_pixel)
+    lines = own.widened(options.surface_sigma_px * line_pixel)
+    point_spacing, end_spacing = spacings(scene.points.xyz, scene.lines.segments)
     table = scene.point_observations
     seen = num_distinct(table.point_idx, table.image_idx, scene.num_points)
     seen = seen + np.bincount(table.point_idx[scene.right_columns.observation_idx], minlength=scene.num_points)
@@ -276,13 +281,13 @@ def _landmarks(scene: Scene, options: StructureOptions) -> Landmarks:
         point_usable,
         scene.lines.segments,
         lines,
-        own,
+        own.by_misfit(),
         line_usable,
         point_spacing,
         end_spacing,
         scene.line_intervals,
-        lengths_per_pixel(scene, "point"),
-        lengths_per_pixel(scene, "line"),
+        point_pixel,
+        line_pixel,
     )
 
 

@@ -20,8 +20,8 @@ import numpy as np
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.terms.relations import lengths_per_pixel
 from groma.mapping.noise.landmarks import GATES as LANDMARK_GATES
-from groma.mapping.noise.landmarks import LineNoise, PointNoise, line_noise, point_noise
-from groma.mapping.structure.find import StructureOptions
+from groma.mapping.noise.landmarks import LineNoise, PointNoise
+from groma.mapping.structure.find import LandmarkNoise, StructureOptions, landmark_noise
 from groma.scene import Scene
 
 #: Deviations that are tried, each five per cent larger than the one before (cost: time).
@@ -33,14 +33,7 @@ _Heights = tuple[IntArray, FloatArray, FloatArray, FloatArray]
 _NOTHING: _Heights = np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros(0)
 
 
-def landmark_noise(scene: Scene, options: StructureOptions) -> tuple[PointNoise, LineNoise]:
-    """Return the noise of points and lines, which does not depend on the planes that are found in them."""
-    return point_noise(scene, options.point_sigma_px), line_noise(scene, options.line_sigma_px)
-
-
-def surface_noise_px(
-    scene: Scene, options: StructureOptions, noise: tuple[PointNoise, LineNoise] | None = None
-) -> float:
+def surface_noise_px(scene: Scene, options: StructureOptions, noise: LandmarkNoise | None = None) -> float:
     """Return the standard deviation of landmarks from the planes that they lie on, as a length in the images, pixels.
 
     Parameters
@@ -51,7 +44,7 @@ def surface_noise_px(
         What they were found with. No more than its ``surface_sigma_px`` is returned, and that where nothing is on a
         plane.
     noise : optional
-        :func:`landmark_noise` of the scene, where it is known already.
+        :func:`~groma.mapping.structure.find.landmark_noise` of the scene, where it is known already.
     """
     plane, height, variance, length = _heights(scene, noise or landmark_noise(scene, options))
     count = np.bincount(plane, minlength=scene.num_planes)[plane]
@@ -85,7 +78,7 @@ def _upper_end(squared: FloatArray, variance: FloatArray, length: FloatArray, mo
     return float(tried[np.flatnonzero(surprise <= surprise.min() + 1.0)[-1]])
 
 
-def _heights(scene: Scene, noise: tuple[PointNoise, LineNoise]) -> _Heights:
+def _heights(scene: Scene, noise: LandmarkNoise) -> _Heights:
     """Of points and of the ends of lines on planes."""
     points, lines = _of_points(scene, noise[0]), _of_lines(scene, noise[1])
     plane, height = np.concatenate([points[0], lines[0]]), np.concatenate([points[1], lines[1]])

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from groma._trees import kd_tree
+from groma._trees import kd_tree, nearest
 from groma._typing import FloatArray, IntArray
 from groma.estimators.membership import Candidates, memberships
-from groma.execution import num_threads
 from groma.gates import chi_square_gate, gate
 from groma.geometry.algebra import dot, norm, unit
 from groma.mapping.groups import distinct_pairs
@@ -121,9 +120,9 @@ def _neighbours(segments: FloatArray, pixel: FloatArray) -> IntArray:
     share = number / (count[owner] - 1)
     samples = segments[owner, 0] + share[:, None] * (segments[owner, 1] - segments[owner, 0])
     ends = segments.reshape(-1, 3)
-    nearest = min(GATES.nearest, len(samples))
-    _, index = kd_tree(samples).query(ends, k=nearest, workers=num_threads())
-    one, other = np.repeat(np.arange(len(ends)) // 2, nearest), owner[index.reshape(len(ends), -1)].ravel()
+    number = min(GATES.nearest, len(samples))
+    _, index = nearest(kd_tree(samples), ends, number)
+    one, other = np.repeat(np.arange(len(ends)) // 2, number), owner[index].ravel()
     different = one != other
     low, high = np.minimum(one, other)[different], np.maximum(one, other)[different]
     return distinct_pairs(low, high)[0]

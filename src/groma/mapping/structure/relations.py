@@ -13,12 +13,12 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from groma._trees import kd_tree
+from groma._trees import kd_tree, nearest
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.association import inlier_probability
 from groma.estimators.membership import Candidates, memberships
 from groma.estimators.plane_search import BAND, PlaneSet, connected_to
-from groma.execution import map_in_threads, num_threads, together
+from groma.execution import map_in_threads, together
 from groma.gates import chi_square_gate, gate
 from groma.geometry.algebra import dot, norm
 from groma.mapping.groups import distinct_pairs
@@ -128,7 +128,7 @@ def spacings(points: FloatArray, segments: FloatArray) -> tuple[FloatArray, Floa
     places = np.concatenate([points, segments.reshape(-1, 3)])
     if len(places) < 2:
         return np.ones(len(points)), np.ones((len(segments), 2))
-    distance, _ = kd_tree(places).query(places, k=min(GATES.neighbor + 1, len(places)), workers=num_threads())
+    distance, _ = nearest(kd_tree(places), places, min(GATES.neighbor + 1, len(places)))
     return distance[: len(points), -1], distance[len(points) :, -1].reshape(-1, 2)
 
 
@@ -317,9 +317,9 @@ def _near_segments(points: FloatArray, segments: FloatArray) -> IntArray:
     first = np.repeat(np.cumsum(count) - count, count)
     share = (np.arange(len(owner)) - first) / (count[owner] - 1)
     samples = segments[owner, 0] + share[:, None] * (segments[owner, 1] - segments[owner, 0])
-    nearest = min(GATES.num_nearest, len(samples))
-    _, index = kd_tree(samples).query(points, k=nearest, workers=num_threads())
-    return distinct_pairs(np.repeat(np.arange(len(points)), nearest), owner[index.reshape(len(points), -1)].ravel())[0]
+    number = min(GATES.num_nearest, len(samples))
+    _, index = nearest(kd_tree(samples), points, number)
+    return distinct_pairs(np.repeat(np.arange(len(points)), number), owner[index].ravel())[0]
 
 
 def _best_of_competing(found: Pairs, competing: BoolArray, num: int) -> Pairs:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
 from groma.execution import map_largest_first, map_work, num_calls
 from groma.features.matches import LineMatches
-from groma.mapping.groups import grouped
+from groma.mapping.groups import distinct_pairs, grouped
 from groma.mapping.lines.clusters import Cluster, clusters
 from groma.mapping.lines.hypotheses.consensus import choose
 from groma.mapping.lines.hypotheses.earlier import Known
@@ -75,6 +75,14 @@ class Places:
     def take(self, rows: IntArray) -> Places:
         """Return the places of some segments; supporters keep their numbers."""
         return Places(**{name: getattr(self, name)[rows] for name in self.names()})
+
+    @cached_property
+    def edges(self) -> IntArray:
+        """(E, 2) pairs of segments that have places, one of which supports the other; the smaller number first."""
+        first, which = np.nonzero(self.supporters >= 0)
+        second = self.supporters[first, which]
+        both = self.found[first] & self.found[second]
+        return distinct_pairs(np.minimum(first, second)[both], np.maximum(first, second)[both])[0]
 
     def ends_in_space(self, views: LineViews) -> FloatArray:
         """(S, 2, 3) end points in the world; meaningless without a place."""

@@ -18,7 +18,6 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_ranges
-from groma.mapping.groups import distinct_pairs
 from groma.mapping.lines.hypotheses.places import Places
 from groma.mapping.lines.views import LineViews
 
@@ -136,11 +135,7 @@ def link(
     members, representative : (m,) int
         Rows of the segments in groups of two and more, and the row that stands for each one's group.
     """
-    first, which = np.nonzero(places.supporters >= 0)
-    second = places.supporters[first, which]
-    usable = free & places.found
-    keep = usable[first] & usable[second]
-    edges, _ = distinct_pairs(np.minimum(first, second)[keep], np.maximum(first, second)[keep])
+    edges = places.edges[free[places.edges].all(axis=1)]
     tables = (
         views.camera, views.center, views.image_idx, views.ray, places.q, places.covariance, sigma, views.line,
         views.ends,
