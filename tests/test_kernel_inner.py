@@ -17,7 +17,7 @@ import pytest
 
 from groma import _numba
 from groma._kernels import inner
-from groma._kernels.inner import Pipeline, _for_linking, _NoMachineCode
+from groma._kernels.inner import Pipeline, _keeping_overloads, _NoMachineCode
 from groma.compiled import kernel, loop
 
 pytestmark = [
@@ -196,11 +196,13 @@ def test_another_process_links_what_this_one_has_kept(tmp_path):
         return subprocess.check_output([sys.executable, path, *names], text=True, env=environment).split()
 
     assert run("total") == ["3.0", "2", "0"]  # the loop, and the kernel for it
-    assert run("largest") == ["1.0", "1", "1"]
+    assert run("largest") == ["1.0", "2", "1"]  # the loop, and Numba's ``max``
     assert run("square", "total") == ["4.0", "3.0", "1", "1"]
     assert run("largest", "square", "total") == ["1.0", "4.0", "3.0", "0", "3"]
     sizes = sorted(file.stat().st_size for file in Path(tmp_path).rglob("*.square-*.nbc"))
     assert len(sizes) == 2 and sizes[0] < 0.7 * sizes[1]
+    (largest,) = Path(tmp_path).rglob("builtins.ol_max.*.nbc")
+    assert largest.parent.name.startswith("groma_")  # where groma's functions lie, not beside those of Numba
 
 
 def _doubled(value):
@@ -222,7 +224,8 @@ def test_numba_uses_its_own_functions_after_they_were_compiled_for_linking(monke
     """Numba makes ``np.empty`` and the like in this way, once in a process."""
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
     made, out, again = [], np.zeros(len(VALUES)), np.zeros(len(VALUES))
-    monkeypatch.setattr(inner, "_for_linking", lambda dispatcher: made.append(_for_linking(dispatcher)) or made[-1])
+    keep = _keeping_overloads
+    monkeypatch.setattr(inner, "_keeping_overloads", lambda by: keep(lambda one: made.append(by(one)) or made[-1]))
     _all_doubled(VALUES, out)
     assert np.array_equal(out, 2.0 * VALUES)
     assert made and not any(any(_has_machine_code(function)) for function in made)

@@ -66,9 +66,10 @@ def test_few_blocks_beside_many_have_no_loop_of_their_own():
 
 
 @pytest.mark.parametrize(("rows", "lanes"), [(1, 1), (3, 9), (4, 6), (6, 10)])
-def test_matrix_times_vector(rows, lanes):
+@pytest.mark.parametrize("sized", [width, any_width])
+def test_matrix_times_vector(rows, lanes, sized):
     rng = np.random.default_rng(rows * 10 + lanes)
     A, x, y = rng.normal(size=2 + rows * lanes), rng.normal(size=3 + lanes), rng.normal(size=1 + rows)
     expected = y[1:] + A[2:].reshape(rows, lanes) @ x[3:]
-    _call_matvec(y, 1, A, 2, x, 3, width(rows), width(lanes))
+    _call_matvec(y, 1, A, 2, x, 3, sized(rows), sized(lanes))
     np.testing.assert_allclose(y[1:], expected, rtol=1e-13, atol=1e-13)

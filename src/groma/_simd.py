@@ -151,6 +151,23 @@ def _product_by_numbers(context, builder, signature, args, accumulate: bool):
     return context.get_dummy_value()
 
 
+def _matvec_by_numbers(context, builder, signature, args):
+    """Do y += A x for sizes that are known when it runs, each sum from left to right."""
+    rows, lanes = (_length(context, builder, signature.args[i], args[i]) for i in (6, 7))
+    y, A, x = (_pointer(context, builder, signature.args[i], args[i], args[i + 1]) for i in (0, 2, 4))
+    total = cgutils.alloca_once(builder, _DOUBLE)
+    with cgutils.for_range(builder, rows) as row:
+        builder.store(ir.Constant(_DOUBLE, 0.0), total)
+        with cgutils.for_range(builder, lanes) as lane:
+            factor = builder.load(builder.gep(A, [builder.add(builder.mul(row.index, lanes), lane.index)]))
+            factor = builder.fpext(factor, _DOUBLE) if factor.type != _DOUBLE else factor
+            product = builder.fmul(factor, builder.load(builder.gep(x, [lane.index])))
+            builder.store(builder.fadd(builder.load(total), product), total)
+        target = builder.gep(y, [row.index])
+        builder.store(builder.fadd(builder.load(target), builder.load(total)), target)
+    return context.get_dummy_value()
+
+
 def _product_signature(args):
     return types.void(*args)
 
@@ -176,6 +193,8 @@ def _add_matvec(typing, y, y0, A, a0, x, x0, rows, lanes):
     signature = types.void(y, y0, A, a0, x, x0, rows, lanes)
 
     def codegen(context, builder, signature, args):
+        if isinstance(rows, types.Array):
+            return _matvec_by_numbers(context, builder, signature, args)
         num_rows, num_lanes = signature.args[6].count, signature.args[7].count
         vectors = _Vectors(builder, num_lanes)
         y_pointer = _pointer(context, builder, signature.args[0], args[0], args[1])

@@ -51,6 +51,7 @@ from groma._kernels import digest as kernel_digest
 from groma._kernels import folder as kernel_folder
 from groma._kernels import inner as kernel_inner
 from groma._kernels import turns as kernel_turns
+from groma._kernels.parts import is_versioned, module_of
 
 #: A file that contains one of these holds compiled code, or chooses it.
 _MARKS = (b"_numba import", b"njit(", b"numba.extending", b"llvmlite")
@@ -210,7 +211,8 @@ class _Cache(FunctionCache):
     _impl_class = kernel_inner.Results
 
     def __init__(self, function: Any, dispatcher: Any = None) -> None:
-        super().__init__(function)
+        self._is_ours = not is_versioned(module_of(function))
+        super().__init__(function if self._is_ours else counted)
         self._function = function
         self._compiled = function if dispatcher is None else dispatcher
         python = f"py{sys.version_info[0]}{sys.version_info[1]}{getattr(sys, 'abiflags', '')}"
@@ -229,20 +231,18 @@ class _Cache(FunctionCache):
         if " at 0x" in kinds or "jitclass." in kinds:
             return None
         found = kernel_digest.dependence(self._compiled, sigutils.normalize_signature(sig)[0])
-        content = _digest((kernel_digest.environment(), kinds, processor, found.content))
+        if not self._is_ours and not found.is_complete:
+            return None
         variant = "for linking" if kernel_inner.is_inside() else "for Python"
+        if not self._is_ours:
+            variant += kernel_inner.inherited()
+        content = _digest((kernel_digest.environment(), kinds, processor, found.content, variant))
         return _Key(_digest((kinds, processor, found.selected, variant)), content)
 
-    def is_there(self, sig: Any, target_context: Any) -> bool:
-        """Whether the function need not be compiled, or is being compiled by another process."""
+    def take_turn(self, sig: Any, target_context: Any) -> bool:
+        """Take the turn to compile the function; False if it is there or another process has the turn."""
         key = self._index_key(sig, target_context.codegen())
-        if key is None or self._cache_file.has(key):
-            return True
-        folder = Path(self.cache_path)
-        if not kernel_turns.take(folder, key.name):
-            return True
-        kernel_turns.give_back(folder, key.name)
-        return False
+        return key is not None and not self._cache_file.has(key) and kernel_turns.take(Path(self.cache_path), key.name)
 
     def is_kept(self, sig: Any, target_context: Any) -> bool:
         """Whether the function lies on disk, so that it need only be loaded."""
@@ -363,7 +363,7 @@ def keep_on_disk(dispatcher: Any) -> Any:
     """Let a compiled function be kept on disk where some folder can be written; return it."""
     if hasattr(dispatcher, "py_func"):  # a plain function without the compiler
         dispatcher._cache = _Unopened(dispatcher)
-        kernel_inner.tell_apart(dispatcher)
+        kernel_inner.tell_apart(dispatcher, keep_on_disk)
     return dispatcher
 
 

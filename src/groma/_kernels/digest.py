@@ -81,6 +81,8 @@ class Dependence:
     content: str
     #: Names of the entries of tables that the argument types select.
     selected: tuple[str, ...]
+    #: Whether all of it could be followed.
+    is_complete: bool
 
 
 def dependence(function: Any, argument_types: tuple) -> Dependence:
@@ -88,9 +90,9 @@ def dependence(function: Any, argument_types: tuple) -> Dependence:
     if find_overloads():
         _look_again()
     lengths, made = _inside(argument_types)
-    digester = _Digester(lengths, [])
+    digester = _Digester(lengths, [], [])
     content = _hash([digester.digest(thing) for thing in (function, *made)])
-    return Dependence(content, tuple(dict.fromkeys(digester.selected)))
+    return Dependence(content, tuple(dict.fromkeys(digester.selected)), not digester.opaque)
 
 
 def environment() -> tuple:
@@ -204,6 +206,8 @@ class _Digester:
     lengths: frozenset[int]
     #: Takes the names of selected entries.
     selected: list[str]
+    #: Takes what cannot be followed.
+    opaque: list[Any]
 
     def digest(self, thing: Any, above: tuple[_Reach, ...] = (), within: tuple[int, ...] = ()) -> str:
         """Digest anything; ``above`` and ``within`` say what leads to it, from the outside in."""
@@ -229,8 +233,9 @@ class _Digester:
             text = [reach.text, *(self.digest(other, above, within) for other in reach.late)]
             packages, is_opaque = set(), reach.is_opaque
         if is_opaque:
+            self.opaque.append(thing)
             packages.update(*(reach.packages for reach in above))
-            text += [_stamp(package) for package in sorted(packages - {""})]
+            text += [_stamp(package) for package in sorted(packages - {""}) if not is_versioned(package)]
         return _hash(text)
 
     def _select(self, table: ByLength, above: tuple[_Reach, ...]) -> list[int]:

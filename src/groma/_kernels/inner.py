@@ -13,7 +13,7 @@ A version of Numba that is not known here compiles in its own way, every functio
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -25,6 +25,7 @@ from numba.core.compiler import Compiler, CompileResult
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.compiler_machinery import PassManager
 from numba.core.sigutils import normalize_signature
+from numba.core.targetconfig import ConfigStack
 from numba.core.typed_passes import NativeLowering as NumbaLowering
 from numba.core.typed_passes import NopythonTypeInference
 from numba.core.typing.templates import _OverloadFunctionTemplate
@@ -47,6 +48,12 @@ _depth = 0
 def is_inside() -> bool:
     """Whether a function is being compiled, so that what is asked for is for linking."""
     return _depth > 0
+
+
+def inherited() -> str:
+    """Return what a function of Numba's takes over from the one that is being compiled (``CPUTargetOptions``)."""
+    flags: Any = ConfigStack.top_or_none()
+    return repr(flags and (sorted(flags.fastmath.flags), flags.error_model, flags.forceinline, flags.nrt))
 
 
 @contextmanager
@@ -98,6 +105,13 @@ class _InnerLibrary(_Library):
     """Code of a function that is linked into others."""
 
     _owns = False
+
+    def _optimize_final_module(self) -> None:
+        """Inline, turn loops round and simplify; the rest is done once, in the function that this becomes part of."""
+        passes, builder = self._codegen._module_pass_manager(
+            loop_vectorize=False, slp_vectorize=False, opt=0, cost="cheap"
+        )
+        passes.run(self._final_module, builder)
 
     def _finalize_final_module(self) -> None:
         self._finalize_dynamic_globals()
@@ -195,8 +209,8 @@ class Results(CompileResultCacheImpl):
         )
 
 
-def tell_apart(dispatcher: Any) -> None:
-    """Keep what has no machine code from Python, which gets it compiled in full."""
+def tell_apart(dispatcher: Any, keep: Callable[[Any], Any]) -> None:
+    """Keep what has no machine code from Python, which gets it compiled in full; ``keep`` is for Numba's functions."""
     kind = type(dispatcher)
 
     def compile_for_caller(signature: Any) -> Any:
@@ -207,7 +221,7 @@ def tell_apart(dispatcher: Any) -> None:
                 return kind.compile(dispatcher, signature)
             if found is not None and isinstance(found.entry_point, _NoMachineCode):
                 del dispatcher.overloads[arguments]
-            with on_demand(), remembering(), _linking_overloads():
+            with on_demand(), remembering(), _keeping_overloads(keep):
                 return kind.compile(dispatcher, signature)
 
     def add_overload(result: Any) -> None:
@@ -223,34 +237,16 @@ def tell_apart(dispatcher: Any) -> None:
 _decorator = _OverloadFunctionTemplate._get_jit_decorator
 
 
-def _linking_decorator(self: Any) -> Any:
-    """Take the place of :meth:`_OverloadFunctionTemplate._get_jit_decorator`: what is compiled by it is for linking."""
-    decorator = _decorator(self)
-
-    def decorate(**options: Any) -> Any:
-        options = {"pipeline_class": Pipeline, **options}
-        return lambda function: _for_linking(decorator(**options)(function))
-
-    return decorate
-
-
-def _for_linking(dispatcher: Any) -> Any:
-    compile_function = dispatcher._compiler.compile
-
-    def compile_inside(*arguments: Any) -> Any:
-        with one_deeper():
-            return completed(compile_function(*arguments))
-
-    dispatcher._compiler.compile = compile_inside
-    tell_apart(dispatcher)
-    return dispatcher
-
-
 @contextmanager
-def _linking_overloads() -> Iterator[None]:
-    """Compile Numba's own functions for linking; for a thread that holds the lock of the compiler."""
+def _keeping_overloads(keep: Callable[[Any], Any]) -> Iterator[None]:
+    """Compile Numba's own functions for linking, and keep them; for a thread that holds the lock of the compiler."""
+
+    def find_decorator(self: Any) -> Any:
+        decorator = _decorator(self)
+        return lambda **options: lambda made: keep(decorator(**{"pipeline_class": Pipeline, **options})(made))
+
     before = _OverloadFunctionTemplate._get_jit_decorator
-    _OverloadFunctionTemplate._get_jit_decorator = _linking_decorator
+    _OverloadFunctionTemplate._get_jit_decorator = find_decorator
     try:
         yield
     finally:

@@ -126,7 +126,7 @@ def compile_ahead(work: str) -> None:
         import_module(module_of_work)
     for module, name, kinds in needed(work):
         compiled = function(module, name)
-        if compiled is not None and not compiled._cache.is_there(kinds, cpu_target.target_context):
+        if compiled is not None and compiled._cache.take_turn(kinds, cpu_target.target_context):
             with suppress(Exception):  # what the list is wrong about is compiled when it is called, or not
                 compiled.compile(kinds)
 

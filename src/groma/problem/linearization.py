@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from groma._simd import width, width_for
+from groma._simd import width_for
 from groma._typing import FloatArray
 from groma.problem._records import chain_rule, cost_scaled, cost_whitened, mask, weigh, whiten
 from groma.problem._room import room_for_chunks, room_for_sums
@@ -26,8 +26,6 @@ from groma.problem.layout import CHUNK_SIZE, Chunk, FactorLayout, Layout, in_run
 from groma.problem.parallel import FACTORS_ALONE, Workers, shares_of, sum_of
 
 States = Mapping[str, FloatArray]
-
-_ONE = width(1)
 
 
 class Noise:
@@ -97,7 +95,10 @@ class NormalEquations:
             for _ in self.shares
         ]
         self._g = [[np.zeros(c.count * c.width) for c in layout.kept] for _ in self.shares]
-        self._sums = [[self._sums_of(share, f) for f in layout.factors] for share in range(len(self.shares))]
+        most = max((len(f.factor) for f in layout.factors), default=0)
+        self._sized = [width_for(len(f.factor), most) for f in layout.factors]
+        numbers = range(len(layout.factors))
+        self._sums = [[self._sums_of(share, f) for f in numbers] for share in range(len(self.shares))]
         self.num_degenerate = [0] * len(layout.factors)
         self.costs = [0.0] * len(layout.factors)
         self.hidden = [0] * len(layout.factors)
@@ -309,12 +310,12 @@ class NormalEquations:
         if noise.matrices is not None:
             whiten(record, begin, noise.matrices)
         cost = weigh(record, begin, noise.scale, noise.step, *noise.loss, norms)
-        references = self._references[f]
+        references, sized = self._references[f], self._sized[f]
         for chain in layout.chains:
             ref = references[chain.reference]
             chain_rule(
                 record, begin, chain.raw_column, chain.column, ref.index, bases[ref.group],
-                width(chain.raw_size), width(chain.dof), _ONE,
+                sized(chain.raw_size), sized(chain.dof), sized(1),
             )  # fmt: skip
         for reference, column, _ in layout.masked:
             ref = references[reference]
@@ -326,9 +327,9 @@ class NormalEquations:
                 add(record, begin, self.blocks_of_chunk(share, chunk, kept_class)[1], *arguments)
         return cost, degenerate
 
-    def _sums_of(self, share: int, layout: FactorLayout) -> list[tuple[Callable, int | None, tuple]]:
+    def _sums_of(self, share: int, f: int) -> list[tuple[Callable, int | None, tuple]]:
         """Return the loops that sum the records of a factor group, the class of W they add to, and arguments."""
-        sized = width_for(len(layout.factor), max(len(other.factor) for other in self.layout.factors))
+        layout, sized = self.layout.factors[f], self._sized[f]
         rows, one = sized(layout.factor.residual_size), sized(1)
         H, g = self._H[share], self._g[share]
         sums: list[tuple[Callable, int | None, tuple]] = []

@@ -287,11 +287,10 @@ class ReducedSystem:
         """Return W delta_c for the landmarks of each eliminated group, (count * dof,)."""
         products = [np.zeros_like(g) for g in self.equations.g_landmarks]
         for e, eliminated in enumerate(self.layout.eliminated):
-            for c, incidences in eliminated.incidences.items():
+            for c, pointer, block, _, widths in self._products[e][1]:
                 _add_incident_steps(
-                    incidences.pointer, incidences.block, self.equations.W[e][c], delta_kept[c], 0, eliminated.count,
-                    products[e], width(eliminated.dof), width(self.layout.kept[c].width),
-                )  # fmt: skip
+                    pointer, block, self.equations.W[e][c], delta_kept[c], 0, eliminated.count, products[e], *widths[:2]
+                )
         return products
 
     def landmark_steps(self, delta_kept: list[FloatArray]) -> list[FloatArray]:
@@ -305,12 +304,11 @@ class ReducedSystem:
                 e = chunk.eliminated
                 if e is None:
                     continue
-                eliminated = self.layout.eliminated[e]
-                dof = width(eliminated.dof)
-                for c, incidences in eliminated.incidences.items():
+                dof, incidences, _ = self._products[e]
+                for c, pointer, block, _, widths in incidences:
                     _add_incident_steps(
-                        incidences.pointer, incidences.block, self.equations.W[e][c], delta_kept[c],
-                        chunk.begin, chunk.end, sums[e], dof, width(self.layout.kept[c].width),
+                        pointer, block, self.equations.W[e][c], delta_kept[c], chunk.begin, chunk.end, sums[e],
+                        *widths[:2],
                     )  # fmt: skip
                 more = _landmark_steps(
                     self.N[e], sums[e], self.equations.V[e], self.equations.g_landmarks[e],
