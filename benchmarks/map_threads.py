@@ -18,7 +18,8 @@ share that was not waiting is processor time. Two idle cores are needed: on a bu
 one that has ended, makes it too low or too high. Waiting is read under ``/proc``; without it is taken as none.
 
 Columns: seconds of processor time and of wall time with one thread, alone, with two threads that lose nothing, and the
-largest memory until then, MB; the same with two threads, with what was serial.
+largest memory until then, MB; the same with two threads, with what was serial, and how often a thread slept because it
+had to wait for another, or for the interpreter: waking one takes some hundredth of a millisecond of either.
 """
 
 import argparse
@@ -46,6 +47,7 @@ def run(images, model, threads):
         if not marks or marks[-1]["stage"] != stage:
             waiting.update(waited())
             used = {"wall": time.monotonic(), "cpu": time.process_time(), "waited": sum(waiting.values())}
+            used["slept"] = resource.getrusage(resource.RUSAGE_SELF).ru_nvcsw
             marks.append({"stage": stage, "peak": peak(), **schedule.until_now(), **used})
 
     mark("imports")
@@ -222,9 +224,9 @@ def stages_of(marks):
     stages = {}
     for before, after in pairwise(marks):
         entry = stages.setdefault(
-            before["stage"], dict.fromkeys(("cpu", "wall", "waited", "shared", "two", "peak"), 0.0)
+            before["stage"], dict.fromkeys(("cpu", "wall", "waited", "slept", "shared", "two", "peak"), 0.0)
         )
-        for name in ("cpu", "wall", "waited", "shared", "two"):
+        for name in ("cpu", "wall", "waited", "slept", "shared", "two"):
             entry[name] += after[name] - before[name]
         entry["peak"] = after["peak"]
     stages[marks[0]["stage"]]["cpu"] += marks[0]["cpu"]
@@ -260,10 +262,10 @@ def main():
             for threads, runs in rounds.items():
                 found = alone([*command, str(threads)], bytecode)
                 runs.append((stages_of(found["marks"]), found))
-    names = ("CPU 1", "wall 1", "alone", "two", "MB 1", "CPU 2", "wall 2", "serial", "MB 2")
+    names = ("CPU 1", "wall 1", "alone", "two", "MB 1", "CPU 2", "wall 2", "serial", "slept", "MB 2")
     print(f"{'stage':28s} " + " ".join(f"{name:>7s}" for name in names))
     columns = [(1, key) for key in ("cpu", "wall", "alone", "two", "peak")]
-    columns += [(2, key) for key in ("cpu", "wall", "serial", "peak")]
+    columns += [(2, key) for key in ("cpu", "wall", "serial", "slept", "peak")]
     table = {
         stage: [median([run[0].get(stage, {}).get(key, 0.0) for run in rounds[threads]]) for threads, key in columns]
         for stage in rounds[2][0][0]

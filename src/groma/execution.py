@@ -32,7 +32,7 @@ from typing import Any, TypeVar
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
-#: Pieces of work that wait for each worker; more would only take memory.
+#: Calls that wait for each worker of another process; more would only take memory.
 _WAITING = 2
 #: What glibc's ``mallopt`` calls the number of places that memory is taken from, the bytes from which on something has
 #: pages of its own, and the free bytes at the end that are kept (the format of the call).
@@ -176,7 +176,9 @@ def map_work(
             results.append(function(item))
             say(len(results), total)
         return results
-    size = 1 if crew.shares_memory else -(-total // (_CALLS * crew.workers))
+    if crew.shares_memory:
+        return take_in_turn(crew.executor, crew.workers - 1, function, items, say)
+    size = -(-total // (_CALLS * crew.workers))
     calls = (items[first : first + size] for first in range(0, total, size))
     pending: deque[Future[list[_Result]]] = deque()
     try:
@@ -193,6 +195,54 @@ def map_work(
             future.cancel()
         wait(pending)
     return results
+
+
+def take_in_turn(
+    executor: Executor,
+    helpers: int,
+    function: Callable[[_Item], _Result],
+    items: Sequence[_Item],
+    progress: Callable[[int, int], None] | None = None,
+) -> list[_Result]:
+    """Return the results of a function of every item, of which this thread and helpers take the next one in turn.
+
+    Nobody is woken for a piece. Helpers that other work keeps busy are not waited for, and what any piece raises ends
+    the work and is raised here. ``progress`` is that of :func:`map_work`, after the first call.
+    """
+    total, said = len(items), 0
+    found: dict[int, _Result] = {}
+    left = deque(range(total))
+
+    def work(told: Callable[[], None]) -> None:
+        try:
+            while True:
+                try:
+                    place = left.popleft()
+                except IndexError:
+                    return
+                found[place] = function(items[place])
+                told()
+        except BaseException:
+            left.clear()
+            raise
+
+    def tell() -> None:
+        nonlocal said
+        while progress is not None and said < len(found):
+            said += 1
+            progress(said, total)
+
+    futures = [executor.submit(work, lambda: None) for _ in range(min(helpers, total - 1))]
+    try:
+        with _set(None):  # within a piece all threads are alike
+            work(tell)
+    finally:
+        begun = [future for future in futures if not future.cancel()]
+        wait(begun)
+    for future in begun:
+        future.result()
+    tell()
+    return [found[place] for place in range(total)]
 
 
 def map_largest_first(
@@ -298,7 +348,7 @@ def _threads(count: int) -> Iterator[_Crew]:
 
 
 @contextmanager
-def _set(crew: _Crew) -> Iterator[None]:
+def _set(crew: _Crew | None) -> Iterator[None]:
     token = _CREW.set(crew)
     try:
         yield

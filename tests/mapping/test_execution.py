@@ -52,31 +52,53 @@ def test_work_keeps_its_order_and_ends_with_an_error(workers):
                 raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            map_work(done.append, range(10_000), interrupted)
-        assert len(done) < 100
+            map_work(lambda i: (time.sleep(1e-4), done.append(i)), range(10_000), interrupted)
+        assert len(done) < 10_000
         with pytest.raises(ZeroDivisionError):
             map_work(lambda i: 1 // i, [1, 0, 1])
         assert map_work(abs, [-1, -2]) == [1, 2]  # the executor is as good as before
 
 
-def test_few_pieces_wait_at_a_time():
-    started, lock = [], threading.Lock()
-    taken = 0
+def test_the_calling_thread_takes_part_and_no_more_pieces_are_begun_than_there_are_workers():
+    running, most, places, lock = 0, 0, set(), threading.Lock()
 
     def work(i):
+        nonlocal running, most
         with lock:
-            started.append(i)
+            running += 1
+            most = max(most, running)
+            places.add(threading.current_thread())
         time.sleep(1e-3)
+        with lock:
+            running -= 1
         return i
 
-    def progress(done, total):
-        nonlocal taken
-        taken = max(taken, len(started) - done)
-
     with work_with(2):
-        map_work(work, range(60), progress)
-    assert len(started) == 60
-    assert taken <= 2 * 2 + 1
+        assert map_work(work, range(60)) == list(range(60))
+    assert most <= 2 and threading.current_thread() in places
+
+
+def test_pieces_do_not_wait_for_threads_that_other_work_keeps_busy():
+    free = threading.Event()
+    with work_with(2):
+        busy = [begin(free.wait) for _ in range(2)]
+        assert map_work(abs, [-1, -2, -3]) == [1, 2, 3]
+        free.set()
+        assert [ask() for ask in busy] == [True, True]
+
+
+def test_a_piece_that_fails_in_another_thread_ends_the_work():
+    main, done = threading.current_thread(), []
+
+    def work(i):
+        if threading.current_thread() is not main:
+            raise ZeroDivisionError
+        done.append(i)
+        time.sleep(1e-3)
+
+    with work_with(2), pytest.raises(ZeroDivisionError):
+        map_work(work, range(10_000))
+    assert len(done) < 10_000
 
 
 def test_what_is_done_beside_a_block_goes_on_in_a_thread_and_is_done_when_it_ends():

@@ -10,13 +10,12 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
-from queue import Empty, SimpleQueue
 from typing import Generic, TypeVar
 
 import numpy as np
 
 from groma._typing import FloatArray
+from groma.execution import take_in_turn
 from groma.problem.layout import Chunk, Layout
 
 T = TypeVar("T")
@@ -42,24 +41,7 @@ class Workers:
             return [function(task) for task in range(tasks)]
         if self._pool is None:
             self._pool = ThreadPoolExecutor(self.count - 1, thread_name_prefix="groma")
-        results: dict[int, T] = {}
-        waiting: SimpleQueue[int] = SimpleQueue()
-        for task in range(tasks):
-            waiting.put(task)
-
-        def work() -> None:
-            with suppress(Empty):
-                while True:
-                    task = waiting.get_nowait()
-                    results[task] = function(task)
-
-        futures = [self._pool.submit(work) for _ in range(min(self.count, tasks) - 1)]
-        try:
-            work()
-        finally:
-            for future in futures:
-                future.result()
-        return [results[task] for task in range(tasks)]
+        return take_in_turn(self._pool, self.count - 1, function, range(tasks))
 
     def close(self) -> None:
         """End the threads."""

@@ -24,8 +24,9 @@ from functools import partial
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.estimators.plane_fit import fit_plane, plane_motions
+from groma.estimators.plane_fit import PlaneFit, fit_plane, plane_motions
 from groma.estimators.plane_search import PlaneSet, connected_to
+from groma.execution import map_in_threads
 from groma.gates import chi_square_gate, gate
 from groma.geometry.algebra import perpendicular
 from groma.mapping.structure.relations import Landmarks, Pairs, RelationGates, on_planes
@@ -264,10 +265,14 @@ def _deviations(points: Pairs, lines: Pairs, num: int) -> FloatArray:
 def _fitted(marks: Landmarks, planes: PlaneSet, points: Pairs, lines: Pairs, rough: FloatArray) -> PlaneSet:
     """Return the planes with a deviation fitted to their members, weighted by their probabilities."""
     plane, covariance = planes.planes.copy(), planes.covariance.copy()
-    for k in np.flatnonzero(rough).tolist():
+
+    def fit(k: int) -> PlaneFit:
         places, noise, away, weight = _members_of(marks, points, lines, k, rough[k])
-        fit = fit_plane(places, noise + away[:, None, None] ** 2 * np.eye(3), weight)
-        plane[k], covariance[k] = fit.plane * np.sign(fit.plane[:3] @ plane[k, :3]), fit.covariance
+        return fit_plane(places, noise + away[:, None, None] ** 2 * np.eye(3), weight)
+
+    deviating = np.flatnonzero(rough).tolist()
+    for k, found in zip(deviating, map_in_threads(fit, deviating), strict=True):
+        plane[k], covariance[k] = found.plane * np.sign(found.plane[:3] @ plane[k, :3]), found.covariance
     return replace(planes, planes=plane, covariance=covariance)
 
 
