@@ -14,9 +14,11 @@ import llvmlite.binding as llvm
 import numba
 import numpy as np
 import pytest
+from numba.core.targetconfig import ConfigStack
 
 from groma import _numba
 from groma._kernels import inner
+from groma._kernels.cache import _Cache
 from groma._kernels.inner import Pipeline, _keeping_overloads, _NoMachineCode
 from groma.compiled import kernel, loop
 
@@ -235,3 +237,22 @@ def test_numba_uses_its_own_functions_after_they_were_compiled_for_linking(monke
         for kinds in list(function.overloads):
             function.compile(kinds)
         assert all(_has_machine_code(function))
+
+
+def test_functions_of_numba_are_kept_by_what_they_hold_and_inherit():
+    """What cannot be followed might be anything, and two processes may mean different things by it."""
+
+    def key(held, **inherited):
+        def implementation(x):
+            return x + held
+
+        implementation.__module__ = "numba.np.arrayobj"
+        flags = numba.core.compiler.Flags()
+        for name, value in inherited.items():
+            setattr(flags, name, value)
+        with ConfigStack().enter(flags):
+            return _Cache(implementation)._key((numba.float64,), ())
+
+    assert key(object()) is None
+    assert key(1.0) == key(1.0)
+    assert len({key(1.0), key(2.0), key(1.0, error_model="numpy"), key(1.0, fastmath=True)}) == 4

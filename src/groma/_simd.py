@@ -9,7 +9,8 @@ the size, ``width(9) == (None,) * 9``. The size is then part of the argument's t
 compiled once for each size and cached on disk as such.
 
 What is rarely done is not worth a loop for each size: :func:`any_width` stands for a size that is known when the loop
-runs, an array of that length. The product then goes number by number, with the same result to the last bit.
+runs, an array of that length. The product of two blocks then goes number by number, with the same result to the last
+bit; that with a vector is summed from left to right.
 
 With ``NUMBA_DISABLE_JIT=1`` the same names are plain NumPy.
 """

@@ -3,8 +3,8 @@
 
 **Where.** The first of these that can be written: the folder in ``NUMBA_CACHE_DIR``; ``__pycache__`` beside the
 sources; Numba's folder of the user (``~/.cache/numba`` on Linux), for installations that are read-only; a folder of
-this process and those that it starts, which ends with it. Where none can
-be written, functions are compiled in every process; nothing fails.
+this process and those that it starts, which ends with it. Where none can be written, functions are compiled in every
+process; nothing fails. Numba's own functions, such as ``np.empty``, lie with those of the package.
 
 **When.** One file per function and argument types. It opens with a digest of all that it depends on: versions, the
 processor and its instructions, the argument types, the function and everything it calls, inlines or reads as a constant

@@ -2,10 +2,10 @@
 """Functions that only other compiled functions call are compiled for linking, and no further.
 
 Numba gives each function machine code and a wrapper that Python calls. A kernel is inlined into the machine code of its
-callers, so both are thrown away. Here a function that is compiled inside another one ends as LLVM's code. What is
-inlined, and so every number, is the same. If Python calls such a function later, it is compiled once more, in full.
-Wrappers are not optimised: a call takes 20 nanoseconds more, of half a microsecond, and compiling a seventh less.
-Numba's own functions that ours call, such as ``np.empty``, are compiled in the same way.
+callers, so both are thrown away. Here a function that is compiled inside another one ends as LLVM's code, simplified
+and no more: it is optimised as part of what it is inlined into. If Python calls such a function later, it is compiled
+once more, in full. Wrappers are not optimised: a call takes 20 nanoseconds more, of half a microsecond, and compiling a
+seventh less. Numba's own functions that ours call, such as ``np.empty``, are compiled in the same way, and kept.
 
 In come the pipeline and the libraries of Numba's compiler; out comes ``Pipeline``, which ``numba.njit`` is told to use.
 A version of Numba that is not known here compiles in its own way, every function in full.
