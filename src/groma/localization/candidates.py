@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import together
 from groma.features.matching.wide_baseline import match_wide_baseline
 from groma.features.segments import Segments
@@ -162,14 +162,19 @@ def _points_near(
         expected[index.point[rows]], rows, (index.descriptor, index.length), query.points.pixels,
         query.points.descriptors, reach,
     )  # fmt: skip
-    order = np.argsort(far, kind="stable")
-    pairs = np.column_stack([second[order], index.point[rows[first[order]]]])
-    # The nearest in description for the point of the query, and for that of the map.
-    best = np.zeros((2, len(pairs)), bool)
-    for side in (0, 1):
-        best[side, np.unique(pairs[:, side], return_index=True)[1]] = True
-    kept = best.all(axis=0)
-    return pairs[kept], far[order[kept]]
+    point = index.point[rows[first]]
+    kept = np.flatnonzero(_nearest(second, far, len(query.points)) & _nearest(point, far, len(index.xyz)))
+    kept = kept[np.argsort(far[kept], kind="stable")]
+    return np.column_stack([second[kept], point[kept]]), far[kept]
+
+
+def _nearest(owner: IntArray, far: FloatArray, count: int) -> BoolArray:
+    """Which rows (n,) are the nearest of their owner, of so many; the first of equal ones."""
+    least = np.full(count, np.inf)
+    np.minimum.at(least, owner, far)
+    rows, first = np.flatnonzero(far == least[owner]), np.full(count, len(far))
+    np.minimum.at(first, owner[rows], rows)
+    return first[owner] == np.arange(len(far))
 
 
 @dataclass(eq=False)
