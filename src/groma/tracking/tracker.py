@@ -238,8 +238,9 @@ class Tracker:
         with watch("find"), work_with(None if mapper.threaded else 1):
             guesses = [attempt.predicted, present.pose] + ([unconfirmed.pose] if unconfirmed is not None else [])
             found = self._verification.find(
-                self.map, data, guesses, attempt.predicted, attempt.prior_sigma, self._lost_for, mapper.frame_pool
-            )
+                self.map, data, guesses, attempt.predicted, attempt.prior_sigma, self._lost_for,
+                self._motion.after_gap, mapper.frame_pool,
+            )  # fmt: skip
         if found is not None and not (
             attempt.trusted and unconfirmed is not None and self._verification.score(unconfirmed) >= found.score
         ):
@@ -277,8 +278,7 @@ class Tracker:
 
     def _start(self, data: FrameFeatures, began: float, watch: Stopwatch) -> TrackedFrame:
         """Make the first keyframes: at once where depth is known, else from the motion between two frames."""
-        if self._initialiser is None:
-            self._initialiser = Initialiser(self.camera, self.options)
+        self._initialiser = self._initialiser or Initialiser(self.camera, self.options)
         with watch("start"):
             poses = self._initialiser.try_start(data)
             if poses is None:

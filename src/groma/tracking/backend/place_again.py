@@ -31,6 +31,7 @@ from groma.tracking.map.lines import assign, expected_segments
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.options import TrackOptions
 from groma.tracking.pose.relocalise import KnownFeatures, known_features, match_near
+from groma.tracking.pose.rivals import num_cells, stands_out
 from groma.tracking.result import map_to_scene
 
 
@@ -87,6 +88,18 @@ class PlaceAgain:
         """Return the features that agree of the k-th keyframe of those known, and of the newest."""
         pairs = self.pairs[self.known.of[self.pairs[:, 0]] == k]
         return self.known.row[pairs[:, 0]], pairs[:, 1]
+
+    def stands_out(self, camera: TrackCamera, gates: TrackingGates) -> bool:
+        """Whether clearly more features agree with the place than with others beside it."""
+        seen = self.newest.features
+        features = PlacedFeatures.of(seen.pixel, seen.descriptor)
+
+        def votes_at(pose: FloatArray) -> int:
+            pairs = match_near(camera, self.known, features, pose, gates.finding.near, gates.features.max_bits_near)
+            return num_cells(camera, seen.pixel[pairs[:, 1]])
+
+        votes = num_cells(camera, seen.pixel[self.pairs[:, 1]])
+        return stands_out(camera, self.pose, votes, votes_at, gates.finding.near)
 
     @property
     def log_scale(self) -> float:

@@ -110,7 +110,8 @@ def find_joint(
             continue
         known = [KnownMap(maps[k], camera) for k in (older, newer)]
         place = measure_place(known[0], known[1], keyframe, newest, (first, second), options)
-        if place is None:
+        # No path tells how the maps lie to each other: what one saw may look like another part of the other.
+        if place is None or not place.stands_out(camera, options.gates):
             continue
         relative, matches = place.keyframe_from_newest, place.matches(0)
         joint = Joint(older, keyframe.index, newer, newest.index, relative, *matches)

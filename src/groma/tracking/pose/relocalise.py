@@ -119,14 +119,19 @@ def _log_alarms(camera: TrackCamera, pixel: FloatArray, agree: BoolArray, max_er
 
     What agrees in one cell of the image counts once.
     """
-    cell = np.floor(pixel / (camera.width / VERDICT.cells)).astype(np.int64)
-    number = cell[:, 1] * (2 * VERDICT.cells) + cell[:, 0]
+    number = cells_of(camera, pixel)
     of, agreeing = len(np.unique(number)), len(np.unique(number[agree]))
     if agreeing <= 3:
         return math.inf
     chance = min(math.pi * max_error**2 / (camera.width * camera.height) * len(pixel) / of, 0.5)
     ways = math.comb(of, agreeing) * math.comb(agreeing, 3) * max(of - 3, 1)
     return math.log(ways) + (agreeing - 3) * math.log(chance)
+
+
+def cells_of(camera: TrackCamera, pixel: FloatArray) -> IntArray:
+    """Numbers (n,) of the cells of the image that pixels are in."""
+    cell = np.floor(pixel / (camera.width / VERDICT.cells)).astype(np.int64)
+    return cell[:, 1] * (2 * VERDICT.cells) + cell[:, 0]
 
 
 @dataclass(frozen=True)

@@ -3,24 +3,28 @@
 
 A pose needs enough points and lines that agree with it, of enough that were looked at. Fewer will do where the depth of
 the frame confirms it: what the map knows to be somewhere is then measured there. Where few agree and
-depth is known, it must; and a pose that was searched must not look through what the map knows.
+depth is known, it must; and a pose that was searched must not look through what the map knows. Where nothing tells what
+the camera sees, after a loss or many missing frames, its place must stand out (:mod:`groma.tracking.pose.rivals`).
 """
 
 from __future__ import annotations
 
+import math
 from concurrent.futures import Executor
 
 import numpy as np
 
-from groma._typing import FloatArray
+from groma._typing import FloatArray, IntArray
 from groma.tracking.frame.camera import TrackCamera, apart, into
+from groma.tracking.frame.descriptor_pairs import PlacedFeatures
 from groma.tracking.frame.features import FrameFeatures
 from groma.tracking.map.points import PointTracks
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.options import TrackOptions
 from groma.tracking.pose.depth_check import depth_agreement
 from groma.tracking.pose.estimate import PoseEstimate
-from groma.tracking.pose.relocalise import Found, find_pose
+from groma.tracking.pose.relocalise import Found, find_pose, match_lines, match_near
+from groma.tracking.pose.rivals import num_cells, stands_out
 
 
 class PoseVerification:
@@ -44,6 +48,13 @@ class PoseVerification:
         gate = self.gates.jump if gate is None else gate
         shift, turn = apart(pose, predicted)
         return bool(shift < gate * np.linalg.norm(sigma[:3]) and turn < gate * np.linalg.norm(sigma[3:]))
+
+    def _says_nothing(self, track_map: TrackMap, sigma: FloatArray) -> bool:
+        """Whether a prediction does not tell what the camera sees: it may have turned by all that it has in view, or
+        moved as far as that is away.
+        """
+        view = 2.0 * math.atan(0.5 * self.camera.width / self.camera.fx)
+        return bool(np.linalg.norm(sigma[3:]) > view or np.linalg.norm(sigma[:3]) > track_map.near.depth)
 
     def trusts(self, track_map: TrackMap, data: FrameFeatures, estimate: PoseEstimate) -> bool:
         """Whether enough agrees with the pose of a frame that was followed; depth decides where that is not much."""
@@ -105,6 +116,23 @@ class PoseVerification:
         _, through = depth_agreement(self.camera, keyframes, data.depth_grid, pose, self.options.gates)
         return through > self.options.gates.depth_check.denies
 
+    def _stands_out(self, track_map: TrackMap, data: FrameFeatures, found: Found) -> bool:
+        """Whether clearly more points and lines agree with a pose than with others beside it."""
+        gates, pixel, camera = self.options.gates, data.features.pixel, self.camera
+        features = PlacedFeatures.of(pixel, data.features.descriptor)
+
+        def pairs_at(pose: FloatArray) -> IntArray:
+            return match_near(camera, found.known, features, pose, gates.finding.near, gates.features.max_bits_near)
+
+        def votes_at(pose: FloatArray) -> int:
+            lines = match_lines(track_map, camera, data, pose, gates.lines.distance, gates.lines.angle)[0]
+            return num_cells(camera, pixel[pairs_at(pose)[:, 1]]) + len(lines.index)
+
+        pose = found.estimate.pose
+        pairs = found.pairs if self.options.points else pairs_at(pose)
+        votes = num_cells(camera, pixel[pairs[:, 1]]) + len(found.lines.index)
+        return stands_out(camera, pose, votes, votes_at, gates.finding.near)
+
     def find(
         self,
         track_map: TrackMap,
@@ -113,14 +141,19 @@ class PoseVerification:
         predicted: FloatArray,
         prior_sigma: FloatArray,
         lost_for: int,
+        after_gap: bool,
         pool: Executor | None = None,
     ) -> Found | None:
-        """Find a frame by described features: near the last keyframes first, then anywhere."""
+        """Find a frame by described features: near the last keyframes first, then anywhere.
+
+        After many frames without a pose, lost or missing, it may be in a place that looks like one of the map.
+        """
+        alone = lost_for > self.gates.lost_frames or (after_gap and self._says_nothing(track_map, prior_sigma))
         if lost_for <= self.gates.lost_frames:
-            found = self.find_near(track_map, data, guesses, predicted, prior_sigma, pool)
+            found = self.find_near(track_map, data, guesses, predicted, prior_sigma, alone, pool)
             if found is not None:
                 return found
-        found = self.find_anywhere(track_map, data)
+        found = self.find_anywhere(track_map, data, alone)
         if found is None or lost_for > self.gates.lost_frames:
             return found
         return found if self.is_near(found.estimate.pose, predicted, prior_sigma) else None
@@ -132,9 +165,13 @@ class PoseVerification:
         guesses: list[FloatArray],
         predicted: FloatArray,
         prior_sigma: FloatArray,
+        alone: bool = False,
         pool: Executor | None = None,
     ) -> Found | None:
-        """Find a frame by described features, near the last keyframes; a part of it in a pool."""
+        """Find a frame by described features, near the last keyframes; a part of it in a pool.
+
+        Where it is ``alone``, without a prediction that tells anything, its place must stand out.
+        """
         nearest = track_map.living()[::-1][: self.gates.nearest]
         wider = self.gates.wider * prior_sigma
         found = find_pose(track_map, self.camera, data, nearest, guesses, predicted, wider, pool)
@@ -143,12 +180,14 @@ class PoseVerification:
         # Rooms are alike at both ends, in depth too: of the features in view some must agree.
         if not (found.score >= self.gates.sure or found.share >= self.gates.min_agreeing or not self.options.points):
             return None
+        if alone and not self._stands_out(track_map, data, found):
+            return None
         enough = self.evidence(found.estimate) >= self.gates.looser * self._least_evidence
         if enough and found.score >= self.gates.min_score and len(found.estimate.weak) <= 2:
             return found
         return found if self._confirmed(nearest, data, found.estimate) else None
 
-    def find_anywhere(self, track_map: TrackMap, data: FrameFeatures) -> Found | None:
+    def find_anywhere(self, track_map: TrackMap, data: FrameFeatures, alone: bool = True) -> Found | None:
         """Find a frame by described features, among recent keyframes and an even choice of the others."""
         living = track_map.living()
         wide = np.array([1e3] * 3 + [10.0] * 3)
@@ -168,7 +207,9 @@ class PoseVerification:
             return None
         if best.score < self.gates.strong and self._contradicted(best.known.keyframes, data, best.estimate):
             return None
-        return None if self._denied(data, best) else best
+        if self._denied(data, best) or (alone and not self._stands_out(track_map, data, best)):
+            return None
+        return best
 
 
 def _share(estimate: PoseEstimate) -> float:
