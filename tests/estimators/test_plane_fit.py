@@ -100,6 +100,29 @@ def test_a_layer_filled_evenly_has_no_plane():
     assert found <= 2
 
 
+def body(seed):
+    """Points of an ellipsoid with radii of 200 to 500 sigma."""
+    rng = np.random.default_rng([7, seed])
+    u = rng.normal(size=(1500 + 500 * (seed % 4), 3))
+    points = u / np.linalg.norm(u, axis=1, keepdims=True) * [5.0, 2.0 + seed // 2, 5.0]
+    return points + rng.normal(0.0, SIGMA, points.shape)
+
+
+def test_a_round_body_has_no_plane():
+    """It fills one side of the layer of planes that touch it: with chances as of both sides 22 are found on these."""
+    bodies = [body(seed) for seed in range(8)]
+    assert sum(len(find_planes(points, noise_of(points))) for points in bodies) <= 2
+
+
+def test_each_face_of_a_box_has_its_plane():
+    """A box, too, is on one side of its faces, but little of it is in their layers."""
+    rng, faces = np.random.default_rng(8), []
+    for axis in range(3):
+        faces += [wall(rng, 100, axis, offset) for offset in (0.0, 4.0)]
+    points = np.concatenate(faces)
+    assert len(find_planes(points, noise_of(points))) == 6
+
+
 def test_chance_is_told_apart_where_it_is_below_all_numbers():
     """Ten times the points make a plane of the same kind far less accidental, and the logarithm stays finite."""
     rng = np.random.default_rng(5)

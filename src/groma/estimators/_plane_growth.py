@@ -249,13 +249,19 @@ class Grower:
         return log10_poisson_tail(inside - 4, chance) + self._log_tried  # three fix it
 
     def _log10_even(self, inner: int, band: float) -> float:
-        """How likely so much of the last layer lies on the plane if the layer is filled evenly, base-10 logarithm.
+        """How likely so much of the last layer lies on the plane if it is filled as its fuller side is, log10.
 
-        The sides of a thin post fill the layer of any plane that cuts through them.
+        A round body fills one side of the layer of a plane that touches it, and the sides of a thin post both sides of
+        the layer of any plane that cuts through them.
         """
-        height, reach = np.abs(self._numbers[0, :inner]), math.sqrt(self._gate) * self._numbers[1, :inner]
-        on, chance = np.count_nonzero(height < reach), float(np.minimum(reach / band, 1.0).mean())
-        return float(np.log10(max(scipy.special.bdtrc(on - 4, inner - 3, chance), 1e-300)))  # three fix it
+        height, reach = self._numbers[0, :inner], math.sqrt(self._gate) * self._numbers[1, :inner]
+        above, below = height >= reach, height <= -reach
+        fuller = above if np.count_nonzero(above) > np.count_nonzero(below) else below
+        on = ~(above | below)
+        counted = reach[on | fuller]
+        chance = float(np.minimum(2.0 * counted / (counted + band), 1.0).mean())
+        tail = scipy.special.bdtrc(np.count_nonzero(on) - 4, len(counted) - 3, chance)  # three fix it
+        return float(np.log10(max(tail, 1e-300)))
 
 
 def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, plane: FloatArray) -> BoolArray:

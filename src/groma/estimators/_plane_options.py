@@ -15,8 +15,8 @@ class PlaneOptions:
     level: float = 0.95
     #: Least number of points; a segment counts as two.
     min_support: int = 10
-    #: Largest standard deviation of the normal, radians. Half a degree.
-    max_tilt: float = 0.0087
+    #: Largest standard deviation of the normal, radians. One degree.
+    max_tilt: float = 0.0175
     #: Least part of the features in the layer around a plane that lie on it.
     min_share: float = 0.2
     #: Expected number of planes found where there are none (convention: of tests by meaningfulness).

@@ -8,8 +8,9 @@ points have their neighbours there anyway. It is kept if
 
 * it has enough support, and its normal is known to ``max_tilt``;
 * so much support would not come about by chance among all planes that were tried;
-* it stands out: of what is in the layer around it, a good share lies on it, and more than would by chance if the layer
-  were filled evenly. Relief without a flat part has no plane, nor has a thin post one that cuts through its sides.
+* it stands out: of what is in the layer around it, a good share lies on it, and more than would by chance if it were
+  filled as the fuller side of the layer is. Relief without a flat part has no plane, nor has a thin post one that cuts
+  through its sides, nor a round body one that touches it.
 
 A segment takes part with its two end points; points on it count no more once it is there.
 

@@ -33,6 +33,7 @@ from groma.geometry.algebra import norm
 from groma.mapping.groups import num_distinct
 from groma.mapping.noise.landmarks import LineNoise, PointNoise, line_noise, point_noise
 from groma.mapping.structure.angles import Vector, angles_between, vertical_of
+from groma.mapping.structure.bending import bending
 from groma.mapping.structure.junctions import meetings
 from groma.mapping.structure.relations import Landmarks, Pairs, on_lines, spacings
 from groma.mapping.structure.rough_planes import on_fitted_planes
@@ -164,7 +165,8 @@ def detect_structure(
     enough = options.planes.min_support
     planes, point_on_plane, line_on_plane = on_fitted_planes(marks, planes, level, (least, least_line), enough)
     support = point_on_plane.counts(len(planes)) + 2 * line_on_plane.counts(len(planes))
-    planes, new = _only(planes, support >= (enough + 1) // 2)
+    kept = (support >= (enough + 1) // 2) & ~bending(marks, planes, point_on_plane, line_on_plane, level)
+    planes, new = _only(planes, kept)
     found |= {"point_on_plane": point_on_plane.renumbered(new), "line_on_plane": line_on_plane.renumbered(new)}
     found["line_along_direction"] = along
     found["point_on_line"] = on_line if options.points_on_lines else Pairs.none()

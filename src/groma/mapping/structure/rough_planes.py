@@ -85,7 +85,7 @@ def _fitted_in_turn(
     """Tell members of planes and fit planes to them in turn."""
     points, lines = on_planes(marks, planes, level, least, known)
     for _ in range(_ROUNDS):
-        rough = _deviations(points, lines, len(planes))
+        rough = deviations(points, lines, len(planes))
         rough[_num_members(points, lines, len(planes)) < min_support] = 0.0
         if not rough.any():
             break
@@ -99,7 +99,7 @@ def _joined(
 ) -> tuple[IntArray, PlaneSet]:
     """Into which plane each goes, and the planes with pieces of rough walls joined: the same ones where none are."""
     num = len(planes)
-    rough, members = _deviations(points, lines, num), _num_members(points, lines, num)
+    rough, members = deviations(points, lines, num), _num_members(points, lines, num)
     free = members > 0
     groups: list[list[int]] = []
     wholes: list[PlaneSet] = []
@@ -168,7 +168,7 @@ def _whole(
         whole, *found = fitted(whole)
         on_whole = found[0], found[1]
         parts = [_share(points, lines, b, *on_whole) > gates.part for b in group]
-        if all(parts) and _deviations(*on_whole, 1)[0]:
+        if all(parts) and deviations(*on_whole, 1)[0]:
             known = _with_shared_deviations(marks, whole, *on_whole, (points, lines), np.where(new < 0, 1, 0))
             if _same_normal(known, 0, planes, group[0], level):
                 break
@@ -254,7 +254,7 @@ def _num_members(points: Pairs, lines: Pairs, num: int) -> np.ndarray:
     return points.counts(num) + 2 * lines.counts(num)
 
 
-def _deviations(points: Pairs, lines: Pairs, num: int) -> FloatArray:
+def deviations(points: Pairs, lines: Pairs, num: int) -> FloatArray:
     """(num,) how far members of each plane deviate, pixels; 0 where their noise explains it."""
     rough = np.zeros(num)
     for found in (points, lines):
@@ -267,7 +267,7 @@ def _fitted(marks: Landmarks, planes: PlaneSet, points: Pairs, lines: Pairs, rou
     plane, covariance = planes.planes.copy(), planes.covariance.copy()
 
     def fit(k: int) -> PlaneFit:
-        places, noise, away, weight = _members_of(marks, points, lines, k, rough[k])
+        places, noise, away, weight = members_of(marks, points, lines, k, rough[k])
         return fit_plane(places, noise + away[:, None, None] ** 2 * np.eye(3), weight)
 
     deviating = np.flatnonzero(rough).tolist()
@@ -276,7 +276,7 @@ def _fitted(marks: Landmarks, planes: PlaneSet, points: Pairs, lines: Pairs, rou
     return replace(planes, planes=plane, covariance=covariance)
 
 
-def _members_of(
+def members_of(
     marks: Landmarks, points: Pairs, lines: Pairs, plane: int, rough: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Points and segment ends on a plane: places (M, 3), covariances, deviations ``rough`` as lengths, weights."""
@@ -297,10 +297,10 @@ def _with_shared_deviations(
 
     ``before`` has the members of the pieces, ``into`` the planes that these are pieces of.
     """
-    covariance, rough = planes.covariance.copy(), _deviations(points, lines, len(planes))
+    covariance, rough = planes.covariance.copy(), deviations(points, lines, len(planes))
     joined = np.bincount(into, minlength=len(planes))[: len(planes)] > 1
     for k in np.flatnonzero(joined & (rough > 0.0)).tolist():
-        places, noise, away, weight = _members_of(marks, points, lines, k, rough[k])
+        places, noise, away, weight = members_of(marks, points, lines, k, rough[k])
         piece = _pieces(points, lines, before, into, k)
         normal = planes.planes[k, :3]
         own = np.einsum("i,nij,j->n", normal, noise, normal)
