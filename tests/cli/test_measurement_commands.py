@@ -76,6 +76,7 @@ def test_poses_and_what_is_held(folder, tmp_path, capsys, monkeypatch):
     [
         ("--directions {folder}/imu.txt", "--direction-sigma 1 (degrees)"),
         ("--direction-sigma 1", "--direction-sigma belongs to --directions"),
+        ("--directions {folder}/imu.txt --direction-sigma -1", "--direction-sigma must be a positive number; got -1"),
         ("--known-planes {folder}/imu.txt", "expected name nx ny nz w sigma"),
         ("--poses {folder}/poses.txt", "--pose-sigma 0.05,0.5"),
         ("--poses {folder}/poses.txt --pose-sigma 1", "must be two positive numbers"),

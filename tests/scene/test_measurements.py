@@ -172,6 +172,8 @@ def test_what_is_not_in_the_scene_is_named(tables, message):
     ("make", "error", "message"),
     [
         (lambda: PointDepths([0], [0], [1.0], [0.0]), InputError, "PointDepths.sigma must be positive; row 0"),
+        (lambda: PointDepths([0], [0], [1.0], [1e-160]), InputError, "PointDepths.sigma must be between 1e-100 and 1e"),
+        (lambda: PointDepths([0], [0], [1.0], [1e160]), InputError, "PointDepths.sigma must be between 1e-100 and 1e"),
         (lambda: RightColumns([0], [1.0], [-0.1]), InputError, "RightColumns.baseline must be positive"),
         (lambda: LineDepths([0], [[1, 1]], [[1, 0]], [0.1]), InputError, "LineDepths.sigma must be positive"),
         (lambda: PlaneObservations([0], [0], [[0, 0, 2, 0]], [np.eye(3)]), InputError, "must be unit vectors"),

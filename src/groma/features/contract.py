@@ -33,6 +33,7 @@ class SegmentDetector(Protocol):
         of each segment, and ``sigma`` is the standard deviation of the end points across the segment. An image
         without edges gives no segments; nothing is raised.
         """
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,9 +62,11 @@ class SegmentMatcher(Protocol):
 
     def describe(self, view: ImageView) -> Any:
         """Return what :meth:`match` needs of one image; called once an image, and kept."""
+        ...
 
     def match(self, first: Any, second: Any) -> LineMatches:
         """Return the matches of two described images; none where nothing is alike."""
+        ...
 
 
 @runtime_checkable
@@ -72,9 +75,11 @@ class ImageRetrieval(Protocol):
 
     def describe(self, image: npt.NDArray[np.generic]) -> Any:
         """Return what :meth:`similarity` needs of one image (H, W) or (H, W, 3), 8 bit; called once an image."""
+        ...
 
     def similarity(self, query: Any, others: Sequence[Any]) -> FloatArray:
         """Return how alike a described image is to each of others, (N,) finite numbers, higher is more alike."""
+        ...
 
 
 __all__ = ["ImageRetrieval", "ImageView", "SegmentDetector", "SegmentMatcher"]

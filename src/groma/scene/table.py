@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 OBJECTS = ("images", "control_points", "lines", "planes", "points", "directions")
 #: How far a stored quaternion may be from length one.
 _QUATERNION_TOLERANCE = 1e-6
+#: The least standard deviation, and the inverse of the largest: variances and their products are finite (derived).
+_LEAST = 1e-100
 
 
 def column(
@@ -304,10 +306,12 @@ def new_index_of(kept: IntArray, size: int) -> IntArray:
 
 
 def check_sigma(name: str, sigma: FloatArray) -> None:
-    """Raise when a standard deviation, or another number, is not positive."""
-    if len(sigma) and not sigma.min() > 0.0:
-        row = int(np.argwhere(sigma == sigma.min())[0, 0])
-        raise InputError(f"{name} must be positive; row {row} is {sigma[row]}. Leave out what is not known at all.")
+    """Raise when a standard deviation, or another number, is not positive, or its square may overflow."""
+    if not len(sigma) or (sigma.min() >= _LEAST and sigma.max() <= 1.0 / _LEAST):
+        return
+    row = int(np.argwhere((sigma < _LEAST) | (sigma > 1.0 / _LEAST))[0, 0])
+    limits = f"between {_LEAST} and {1.0 / _LEAST}" if np.min(sigma[row]) > 0.0 else "positive"
+    raise InputError(f"{name} must be {limits}; row {row} is {sigma[row]}. Leave out what is not known at all.")
 
 
 def check_unique(name: str, ids: IntArray) -> None:

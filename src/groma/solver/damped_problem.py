@@ -64,41 +64,54 @@ class DampedProblem(Protocol[T]):
     @property
     def num_factors(self) -> int:
         """How many factors share the cost."""
+        ...
 
     @property
     def damping(self) -> float:
         """The damping of the next step; the largest, where there are many."""
+        ...
 
     @property
     def linear_iterations(self) -> int:
         """Iterations of the linear solver in the last step; 0 for direct solvers."""
+        ...
 
     def start(self) -> T:
         """Evaluate the problem at its initial states."""
+        ...
 
     def linearize(self) -> None:
         """Form the normal equations of the present states and damping, unless they are formed."""
+        ...
 
     def largest_gradient(self) -> float:
         """Return the largest component of the gradient, each over the root of its diagonal in the normal equations."""
+        ...
 
     def is_curved(self) -> bool:
         """Whether the linearised cost depends on any variable: some factor counts."""
+        ...
 
     def try_step(self) -> T:
         """Solve for a step and evaluate the states after it; :meth:`Trial.without_step` where there is none."""
+        ...
 
     def stretch(self, trial: T, factor: float) -> T:
         """Evaluate a multiple of the step of a trial; return the trial itself where multiples do not apply."""
+        ...
 
     def refine(self, trial: T) -> T:
         """Improve a trial that will be accepted; the trial itself where there is nothing to improve it with."""
+        ...
 
     def rescue(self, trial: T) -> T:
         """Improve a trial that would be refused; the trial itself where there is nothing to improve it with."""
+        ...
 
     def accept(self, trial: T) -> None:
         """Take the states of a trial, and lower the damping."""
+        ...
 
     def refuse(self, trial: T) -> Termination | None:
         """Keep the states and raise the damping; return why to stop where that is of no use."""
+        ...

@@ -36,12 +36,15 @@ class Damping(Protocol):
 
     def lowered(self, gain_ratio: float) -> float:
         """Return the damping after an accepted step."""
+        ...
 
     def accept(self, gain_ratio: float) -> None:
         """Adapt to an accepted step."""
+        ...
 
     def refuse(self, trial: Trial) -> Termination | None:
         """Adapt to a refused step; return why to stop where there is no use in trying on."""
+        ...
 
 
 class NielsenDamping:

@@ -128,7 +128,7 @@ class Measured:
     ] = False
 
     def validate(self) -> None:
-        """Refuse options without the measurements that they apply to."""
+        """Refuse standard deviations that are not positive, and options without the measurements that they apply to."""
         needs = {
             "--position-sigma": (self.position_sigma, self.positions, "--positions"),
             "--control-sigma": (self.control_sigma, self.control, "--control"),
@@ -141,6 +141,8 @@ class Measured:
             "--crs": (self.crs, self.positions or self.control, "--positions or --control"),
         }
         for option, (given, needed, name) in needs.items():
+            if isinstance(given, float) and not 0.0 < given < float("inf"):
+                raise InputError(f"{option} must be a positive number; got {given:g}.")
             if given is not None and needed is None:
                 raise InputError(f"{option} belongs to {name}. Add it, or leave {option} out.")
 

@@ -30,23 +30,29 @@ class LinearSolver(Protocol):
     @property
     def name(self) -> str:
         """What reports call it."""
+        ...
 
     @property
     def num_iterations(self) -> int:
         """Iterations of the last solve; 0 for direct solvers."""
+        ...
 
     @property
     def residual(self) -> list[FloatArray] | None:
         """Return b - S x of the last solve by class, flat; None for direct solvers."""
+        ...
 
     def expected_seconds(self) -> float:
         """Return how long a solve should take; infinite for a solver that ``auto`` should not take."""
+        ...
 
     def follow(self, states: Mapping[str, FloatArray]) -> None:
         """Take notice of the states at which the next systems are formed."""
+        ...
 
     def solve(self, blocks: Blocks, rhs: list[FloatArray]) -> list[FloatArray] | None:
         """Return x by class, flat, or None when S is not positive definite."""
+        ...
 
 
 Make = TypeVar("Make", bound=Callable[[Layout], LinearSolver])

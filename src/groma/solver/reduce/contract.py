@@ -24,9 +24,12 @@ class Reducer(Protocol):
 
     def sum(self, values: ComplexArray) -> ComplexArray:
         """Return the sums over processes of exact sums of one shape; ``values`` may be overwritten."""
+        ...
 
     def union(self, numbers: IntArray) -> IntArray:
         """Return the numbers that any process has, sorted; those of one process are sorted and differ."""
+        ...
 
     def gather(self, text: str) -> list[str]:
         """Return a text of every process, by rank."""
+        ...

@@ -29,3 +29,4 @@ class Journal(Protocol):
 
     def keep(self, states: States, waypoint: Waypoint) -> None:
         """Keep where the solve stands; called by all processes after every accepted step."""
+        ...

@@ -23,22 +23,27 @@ class Uncertainty(Protocol):
     @property
     def gauge(self) -> str:
         """Gauge of the covariances."""
+        ...
 
     @property
     def points(self) -> FloatArray:
         """(P, 3, 3)"""
+        ...
 
     @property
     def lines(self) -> FloatArray:
         """(L, 6, 6)"""
+        ...
 
     @property
     def planes(self) -> FloatArray:
         """(K, 4, 4)"""
+        ...
 
     @property
     def centers(self) -> FloatArray:
         """(N, 3, 3)"""
+        ...
 
 
 @dataclass(frozen=True)

@@ -51,17 +51,21 @@ class Report(Protocol):
     @property
     def history(self) -> Sequence[Any]:
         """Steps: mappings or objects with iteration, cost, accepted."""
+        ...
 
     @property
     def warnings(self) -> Sequence[str]:
         """Sentences for the user."""
+        ...
 
     @property
     def termination(self) -> Any:
         """An enumeration member with a ``sentence``."""
+        ...
 
     def to_dict(self) -> dict[str, Any]:
         """Return the numbers of the machine-readable report."""
+        ...
 
 
 @dataclass(frozen=True)

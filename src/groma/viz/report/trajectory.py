@@ -49,18 +49,22 @@ class Frame(Protocol):
     @property
     def timestamp(self) -> float:
         """Seconds."""
+        ...
 
     @property
     def status(self) -> str:
         """Such as ``tracked`` or ``lost``."""
+        ...
 
     @property
     def counts(self) -> Mapping[str, int]:
         """Agreeing points, lines and planes."""
+        ...
 
     @property
     def timings(self) -> Mapping[str, float]:
         """Seconds by stage, and ``total``."""
+        ...
 
 
 class Track(Protocol):
@@ -69,22 +73,27 @@ class Track(Protocol):
     @property
     def trajectory(self) -> Trajectory:
         """world_from_cam of all frames with a pose."""
+        ...
 
     @property
     def scene(self) -> Scene:
         """The map."""
+        ...
 
     @property
     def keyframes(self) -> FloatArray:
         """Time stamps of the keyframes."""
+        ...
 
     @property
     def statistics(self) -> Mapping[str, Any]:
         """Counts, and ``milliseconds`` by stage."""
+        ...
 
     @property
     def warnings(self) -> Sequence[str]:
         """Sentences for the user."""
+        ...
 
 
 def write_track_report(
