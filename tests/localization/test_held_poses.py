@@ -58,7 +58,7 @@ def test_their_size_is_found():
 
 @pytest.mark.kernels
 def test_exact_poses_are_exact():
-    """What remains is less than a third of what noise alone makes of a pose in the mean; mostly it is nothing."""
+    """In the mean less is found than what noise alone makes of one pose that its own points are fitted to."""
     found, alone = [], []
     for seed in range(8):
         scene = _world(seed, (0.0, 0.0))[3]
