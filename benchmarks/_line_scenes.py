@@ -13,6 +13,7 @@ from _rendered_boxes import BoxSettings, render_boxes
 from _workshop import CACHE
 
 from groma.features import LsdDetector, Segments
+from groma.features.close_edges import CloseEdges
 from groma.io import read_scene
 from groma.io.colmap.model import from_pycolmap
 from groma.scene import Scene
@@ -34,7 +35,7 @@ class LineScene:
 
     def segments(self, min_length: float) -> list[Segments]:
         """Return groma's segments of each image."""
-        detector = LsdDetector(min_length=min_length)
+        detector = CloseEdges(LsdDetector(min_length=min_length))
         return [detector.detect(image) for image in self.images]
 
 

@@ -2,6 +2,7 @@
 """Renderings with exact truth: anti-aliased polygons whose edges are known below a hundredth of a pixel."""
 
 import numpy as np
+from scipy.special import ndtr
 
 
 def coverage(vertices, width, height, samples=8):
@@ -63,3 +64,33 @@ def board(rng, width=320, height=240, tiles=14):
         cover = coverage(corners, width, height, 4)
         image = image * (1.0 - cover) + rng.uniform(10.0, 245.0) * cover
     return image
+
+
+def _twice_integrated(x, blur):
+    """Second integral of a blurred step."""
+    z = x / blur
+    density = np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi)
+    return 0.5 * ((x * x + blur * blur) * ndtr(z) + blur * x * density)
+
+
+def steps(angle, offsets, heights, base, blur, size=96, turn=0.0):
+    """Steps across parallel lines, blurred and integrated over square pixels exactly; offsets are to the right hand.
+
+    Steps after the first are turned by an angle against it.
+    """
+    y, x = np.mgrid[0:size, 0:size] + 0.5 - size / 2
+    image = np.full((size, size), float(base))
+    for k, (offset, height) in enumerate(zip(offsets, heights, strict=True)):
+        at = angle + (turn if k else 0.0)
+        distance = y * np.cos(at) - x * np.sin(at) - offset
+        a, b = max(abs(np.sin(at)), 1e-3), max(abs(np.cos(at)), 1e-3)
+        corners = [(a + b, 1.0), (a - b, -1.0), (b - a, -1.0), (-a - b, 1.0)]
+        image += height * sum(sign * _twice_integrated(distance + c / 2, blur) for c, sign in corners) / (a * b)
+    return image
+
+
+def segment_on(angle, offset, length, size=96):
+    """Ends (1, 4) of a segment along the middle of a step of :func:`steps`, darker side left if it rises."""
+    along, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+    middle = size / 2 + offset * across
+    return np.concatenate([middle - 0.5 * length * along, middle + 0.5 * length * along])[None]

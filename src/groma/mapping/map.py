@@ -33,6 +33,7 @@ from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult
 from groma.adjustment.survey.given import Survey
 from groma.execution import begin, work_with
+from groma.features.close_edges import CloseEdges
 from groma.features.external import ExternalMatches
 from groma.features.matches import LineMatches
 from groma.features.registry import DETECTORS
@@ -273,6 +274,9 @@ def find_segments(
     if line_matches is not None:
         return given_segments(folder, scene, line_matches, say)
     detector = DETECTORS.make(options.detector, min_length=options.min_segment_length, max_segments=0)
+    if not options.refine_poses:
+        # Cameras are determined better by places that vary less from view to view, lines by those on the edges.
+        detector = CloseEdges(detector)
     return detect_segments(folder, scene, detector, say)
 
 
