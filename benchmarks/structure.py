@@ -332,7 +332,7 @@ def along_exact(truth: Truth, scene: Scene, fewest: int) -> Scene:
     ):
         turned = np.hypot(angle, px * np.sqrt(2.0) * marks.line_pixel[lines] / length[lines])
         pool = Parallel.of(scene.lines.plucker[lines, 3:], covariance, turned)
-        density = np.vstack([_members(pool, vectors, gates), _anywhere(pool)])
+        density = np.vstack([_members(pool, vectors), _anywhere(pool)])
         share = np.full((len(density), 1), 1.0 / len(density))
         for _ in range(gates.rounds):
             mixed = np.log(share) + density
