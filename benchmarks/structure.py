@@ -10,8 +10,9 @@ mapped line stands for the edge that it lies on; lines that are no edges of the 
 true pairs of usable lines and points with what enough of them share: a plane of ten points or segment ends, a direction
 of four lines. Maps are kept in the cache, without their structure.
 
-With --exact: lines along directions where the true directions are given exactly, those of four lines or more, or of
-two, so that only what belongs to which is to be decided: what the noise of the lines leaves possible.
+With --exact: lines along directions as found, the same where an edge that is turned by less than half a degree counts
+as along, and where the true directions are given exactly, those of four lines or more, or of two, so that only what
+belongs to which is to be decided: what the noise of the lines leaves possible.
 
 With --held: what relations bring. The cameras are free, with the exact ones as the start; root mean square of the
 centres after the best similarity, of the ends of true edges from their lines, and of the angles between planes
@@ -56,7 +57,8 @@ KINDS = (
     "parallel",
     "right_angles",
 )
-#: Lines that an exactly given direction has at least.
+#: Lines along directions: columns of --exact, and the lines that an exactly given direction has at least.
+ALONG = ("line_along_direction", "within half a degree")
 FEWEST = (4, 2)
 #: Relations of planes and directions, and the tables they are between.
 ANGLES = {
@@ -279,7 +281,7 @@ def along_exact(truth: Truth, scene: Scene, fewest: int) -> Scene:
     ):
         turned = np.hypot(angle, px * np.sqrt(2.0) * marks.line_pixel[lines] / length[lines])
         pool = Parallel.of(scene.lines.plucker[lines, 3:], covariance, turned)
-        density = np.vstack([_members(pool, vectors, gates), _anywhere(pool)])
+        density = np.vstack([_members(pool, vectors), _anywhere(pool)])
         share = np.full((len(density), 1), 1.0 / len(density))
         for _ in range(gates.rounds):
             mixed = np.log(share) + density
@@ -317,7 +319,7 @@ def main() -> None:
     if given.held:
         _print_held({name: everything[name] for name in names}, given.cache)
         return
-    kinds = [f"directions of {fewest} lines" for fewest in FEWEST] if given.exact else KINDS
+    kinds = (*ALONG, *(f"directions of {fewest} lines" for fewest in FEWEST)) if given.exact else KINDS
     print("Recall / precision, per cent (true ones)\n")
     print("| scene | " + " | ".join(kind.replace("_", " ") for kind in kinds) + " |")
     print("|---" + "|---:" * len(kinds) + "|")
@@ -325,11 +327,10 @@ def main() -> None:
     for name in names:
         rendered, scene = mapped(name, everything[name], given.cache)
         truth = truth_of(rendered, scene)
+        found = counts(truth, find_structure(scene, StructureOptions()))
         if given.exact:
-            exact = [counts(truth, along_exact(truth, scene, fewest))["line_along_direction"] for fewest in FEWEST]
-            found = dict(zip(kinds, exact, strict=True))
-        else:
-            found = counts(truth, find_structure(scene, StructureOptions()))
+            exact = [counts(truth, along_exact(truth, scene, fewest))[ALONG[0]] for fewest in FEWEST]
+            found |= dict(zip(kinds[len(ALONG) :], exact, strict=True))
         print(f"| {name} | " + " | ".join(_cell(found.get(kind, (0, 0, 0))) for kind in kinds) + " |", flush=True)
         total = {kind: total[kind] + np.array(found.get(kind, (0, 0, 0))) for kind in kinds}
     print("| all | " + " | ".join(_cell(total[kind]) for kind in kinds) + " |")
