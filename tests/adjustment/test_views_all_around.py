@@ -108,7 +108,7 @@ def test_calibration_is_estimated_where_it_is_not_known():
     options = groma.AdjustOptions(loss="none", refine_intrinsics=True, lines=False)
     found = groma.adjust(start.with_params(right * [1.01, 1, 1, 1, 1]), options).scene.cameras.params
     assert abs(found[0, 0] / right[0, 0] - 1) < 2e-3
-    np.testing.assert_array_equal(found[0, 1:3], right[0, 1:3])
+    np.testing.assert_allclose(found[0, 1:3], right[0, 1:3], atol=0.5)  # the middle, which counts as a guess
     truth, start, _ = room("EQUIRECTANGULAR", num_images=4)
     result = groma.adjust(start, options)
     np.testing.assert_array_equal(result.scene.cameras.params, truth.cameras.params)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from groma.adjustment.terms.principal_points import near_the_middle
 from groma.cli.main import run
 from groma.errors import InputError, OutputError
 from groma.evaluation.poses import evaluate_poses
@@ -21,7 +22,8 @@ from groma.mapping import map as mapping
 from groma.mapping.map import map_images
 from groma.mapping.options import MapOptions
 from groma.mapping.photographs import check_names, read_gray
-from groma.scene import Planes, PointObservations, Points
+from groma.scene import Planes, PointObservations, Points, PrincipalPointPriors
+from groma.scene.synthetic.scenes import holistic
 
 
 def write_images(folder, scene, shape=(768, 1024), value=0):
@@ -80,6 +82,21 @@ def test_images_of_one_colour_give_an_explained_empty_map(tmp_path, model, value
     assert few.sentences[0].startswith("25 of 29 photographs were not placed. All findings are about the other 4.")
     assert not any("is determined" in sentence for sentence in few.sentences)
     assert any("is determined" in sentence for sentence in replace(result, num_photographs=5).diagnose().sentences)
+
+
+def test_calibrations_that_nobody_gave_are_estimated_in_the_end(tmp_path):
+    guessed = near_the_middle(holistic(10, seed=2).start.points_only())
+    folder = write_images(tmp_path / "plain", guessed)
+    for number, (model, refine) in enumerate(
+        ((guessed, None), (guessed, False), (guessed.replace(principal_point_priors=PrincipalPointPriors()), None))
+    ):
+        found = map_images(folder, tmp_path / str(number), model, MapOptions(refine_intrinsics=refine, threads=1))
+        is_estimated = number == 0
+        numbers = found.summary()
+        assert numbers["estimated"] == {"poses": True, "intrinsics": is_estimated}
+        assert (found.scene.cameras.params != model.cameras.params).all() == is_estimated
+        assert found.pose_uncertainty()["calibration"] == ("none" if is_estimated else "all")
+        assert len(found.scene.principal_point_priors) == len(model.principal_point_priors)
 
 
 def test_images_of_one_colour_without_a_model(tmp_path, model):
