@@ -53,8 +53,8 @@ def add_patches(
 ) -> list[Any]:
     """Add polygons, those of one colour as one object: hundreds of planes are then drawn quickly."""
     group, nodes = patch_groups(members) if patches else np.zeros(0, np.int64), []
-    for colour in np.unique(group).tolist():
-        vertices, faces = triangle_fans([patches[plane] for plane in np.flatnonzero(group == colour)])
+    for colour in np.unique(group):
+        vertices, faces = triangle_fans([patches[plane] for plane in np.flatnonzero(group == colour).tolist()])
         red, green, blue = (int(channel) for channel in PALETTE[colour])
         nodes.append(server.scene.add_mesh_simple(
             f"{name}/{colour}", vertices.astype(np.float32), faces.astype(np.uint32),
