@@ -7,9 +7,10 @@ are one pixel apart, and a tenth of a pixel where they are four. The displacemen
 that no residual tells it. Here the grey levels around a fitted segment are explained by steps under a common blur, that
 of usual photographs unless the profile says otherwise (:mod:`groma.features.steps`).
 
-One step is fitted to the pixels close to it. Where two steps explain all of the profile, and a likelihood ratio asks
-for the second, the place is that of the segment's own step of the two, weighed against the displacements that the
-first fit may still have; what is then unknown is added to the variance of the segment.
+One step is fitted to the pixels close to it; an edge that is softer than photographs are stays where it is.
+Where two steps explain all of the profile, and a likelihood ratio asks for the second, the place is that of the
+segment's own step of the two, weighed against the displacements that the first fit may still have; what is then unknown
+is added to the variance of the segment.
 """
 
 from __future__ import annotations
@@ -87,13 +88,10 @@ def _one_step(whole, left, right, given, close, p, H):
 
 
 @loop
-def _second_step(bins, whole, given, limits, p, H):
-    """Fit two steps, p being one; return the factor by which noise is larger, 0 where they do not explain more."""
-    any_spread, max_shift, evidence, misfit = limits
-    log_blur, _, noise2, misfit2, center, reach = given
-    alone = fit(whole, p, ONE, (log_blur, any_spread, noise2, misfit2, center, reach), H)
-    # No second step could gain more than all that is left.
-    if alone < evidence or not two_steps(whole, given, max_shift, p):
+def _second_step(bins, whole, given, alone, limits, p, H):
+    """Fit two steps; return the factor by which noise is larger, 0 where they do not explain more than one."""
+    max_shift, evidence, misfit = limits
+    if not two_steps(whole, given, max_shift, p):
         return 0.0
     together = fit(whole, p, TWO, given, H)
     used = 0
@@ -123,10 +121,16 @@ def _place_all(image, ends, fitted, gates, new_ends, added):
         if not right > left:
             continue
         given = math.log(blur), spread, noise**2, (model * (right - left)) ** 2, 0.0, REACH + 1.0
-        _one_step(whole, left, right, given, close, p, H)
-        # Its tilt is that of the fitted segment: places along it vote for that one by one.
-        offset, tilt = (p[3], 0.0) if p[2] > 0.0 and abs(p[3]) <= max_shift else (0.0, 0.0)
-        scale = _second_step(bins, whole, given, (any_spread, max_shift, evidence, misfit), p, H)
+        p[0], p[1], p[2], p[3], p[4] = left, given[0], right - left, 0.0, 0.0
+        alone = fit(whole, p, ONE, (given[0], any_spread, *given[2:]), H)
+        offset, tilt, scale = 0.0, 0.0, 0.0
+        if p[1] < given[0] + spread:  # a softer edge has no place of its own close to it
+            _one_step(whole, left, right, given, close, p, H)
+            # Its tilt is that of the fitted segment: places along it vote for that one by one.
+            offset = p[3] if p[2] > 0.0 and abs(p[3]) <= max_shift else 0.0
+        # No second step could gain more than all that is left.
+        if alone > evidence:
+            scale = _second_step(bins, whole, given, alone, (max_shift, evidence, misfit), p, H)
         if scale > 0.0:
             own = _own_step(p, max_shift)
             share = displacement**2 / (displacement**2 + scale * variance(H, own + 1, unit, x))
