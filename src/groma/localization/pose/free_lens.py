@@ -20,6 +20,7 @@ from typing import Literal
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.adjustment.terms.principal_points import GATES as PRINCIPAL_POINTS
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.gates import REFINEMENT
 
@@ -90,7 +91,7 @@ def free_lens(camera: QueryCamera, lens: LensUnknowns) -> FreeLens | None:
     kind, unknown = camera.kind, lens == "all"
     center = np.array(kind.principal_point_indices if lens != "focal" else (), np.int64)
     distortion = np.array(kind.extra_indices[:1] if unknown else (), np.int64)
-    sigma = REFINEMENT.centred * max(camera.width, camera.height) if unknown else np.inf
+    sigma = PRINCIPAL_POINTS.centred * max(camera.width, camera.height) if unknown else np.inf
     shape = unknown and len(kind.focal_indices) == 2
     focal = np.array(kind.focal_indices)
     return FreeLens(focal, center, distortion, shape, camera.params[center], sigma, 0.5 * REFINEMENT.square)

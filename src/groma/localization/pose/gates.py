@@ -33,10 +33,6 @@ class RefinementGates:
         1.9, "sigma", "scale of the Geman-McClure loss that follows, of many matches", "chosen on stairs of 7-Scenes"
     )
     cells: int = gate(8, "cells", "per longer side: errors within one may be alike", "derived from sizes of surfaces")
-    centred: float = gate(
-        0.01, "share", "of the longer side: standard deviation of an unknown principal point from the middle",
-        "derived from calibrated cameras: 0.5 to 1.2 %",
-    )  # fmt: skip
     square: float = gate(
         0.003, "1", "standard deviation of the logarithm of an unknown shape of pixels",
         "derived from calibrated cameras: 0 to 0.007",
