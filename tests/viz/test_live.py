@@ -140,6 +140,7 @@ def test_a_track_writes_what_the_page_shows(tmp_path):
     tracker = SimpleNamespace(_present=SimpleNamespace(followed=SimpleNamespace(points=points, lines=lines)))
     journal = Journal(tmp_path / "out.work")
     journal.frame(tracked, frame, tracker)  # type: ignore[arg-type]
+    journal.close()
     found = glance.read_statuses(tmp_path / "out.work" / "statuses.txt")
     assert found.counts.tolist() == [[3, 0, 0]] and found.keyframe.tolist() == [True]
     with np.load(tmp_path / "out.work" / "now.npz") as now:  # reduced by two
