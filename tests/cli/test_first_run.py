@@ -26,7 +26,7 @@ def test_what_is_listed_exists(work):
     """After a function was renamed, or its arguments changed: python packaging/needed_functions.py."""
     entries = needed.needed(work)
     assert needed.imported(work) is not None
-    assert len(entries) > 15
+    assert len(entries) > 10
     for module, name, kinds in entries:
         compiled = needed.function(module, name)
         assert compiled is not None, f"{module}.{name}"
@@ -53,7 +53,7 @@ def test_points_alone_have_a_list_of_their_own(is_estimated):
     modules = {module.rpartition(".")[2] for module, *_ in needed.needed(work)}
     assert "point_reprojection" in modules
     assert not modules & {"line_reprojection", "line_cartesian", "plane_normal_offset", "point_on_plane"}
-    assert len(needed.needed(work)) < 0.8 * len(needed.needed("adjust"))
+    assert len(needed.needed(work)) < 0.85 * len(needed.needed("adjust"))
     assert needed.adjusting(("PINHOLE",), is_estimated, False) == "adjust"
     assert needed.adjusting(("PINHOLE", "OPENCV"), is_estimated, True) == "adjust"
     assert needed.adjusting(("A_MODEL_OF_A_PLUGIN",), is_estimated, True) == "adjust"

@@ -8,13 +8,13 @@ import pytest
 
 from groma.adjustment.assemble import assemble, disassemble
 from groma.adjustment.assembly_options import AssemblyOptions
+from groma.adjustment.terms.principal_points import GATES as PRINCIPAL_POINTS
 from groma.adjustment.terms.principal_points import near_the_middle
 from groma.evaluation.alignment import align_points
 from groma.geometry import quaternion, se3
 from groma.localization.errors.common_errors import GATES, CommonErrors, common_errors
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.free_lens import free_lens
-from groma.localization.pose.gates import REFINEMENT
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.records import landmark_covariances
@@ -79,7 +79,7 @@ def _map(seed, num_images=8, is_unknown=False):
         ),
     )
     if is_unknown:
-        off = REFINEMENT.centred * truth.cameras.width[0] * np.random.default_rng(1000 + seed).normal(size=2)
+        off = PRINCIPAL_POINTS.centred * truth.cameras.width[0] * np.random.default_rng(1000 + seed).normal(size=2)
         points, lines = noisy.point_observations, noisy.line_observations
         noisy = noisy.replace(
             point_observations=points.replace(pixel=points.pixel + off),
@@ -126,7 +126,9 @@ def test_queries_are_as_uncertain_as_the_map(calibration):
         of_map = calibration.startswith("that of the map")
         camera = QueryCamera.of(world.scene.cameras, 0) if of_map else world.camera
         if calibration == "unknown":
-            off = REFINEMENT.centred * camera.width * np.random.default_rng(seed).normal(size=2)  # the prior is true
+            off = (
+                PRINCIPAL_POINTS.centred * camera.width * np.random.default_rng(seed).normal(size=2)
+            )  # the prior is true
             camera = replace(camera, params=camera.params * [1.02, 1.02, 1.0, 1.0] + [0.0, 0.0, *off])
         lens = free_lens(camera, "all" if calibration == "unknown" else "none")
         limit = max_errors(world.matches)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from worlds import CAMERA, make_world, project
 
+from groma.adjustment.terms.principal_points import GATES as PRINCIPAL_POINTS
 from groma.factors.losses import Cauchy, GemanMcClure
 from groma.geometry import se3
 from groma.localization.candidates import closest_of
@@ -175,7 +176,7 @@ def test_the_most_alike_matches_are_counted():
 def unknown_lens(rng):
     """A lens that is drawn from the priors, and one in the middle with another focal length."""
     width, height = 640, 480
-    off, shape = REFINEMENT.centred * width * rng.normal(size=2), np.exp(0.5 * REFINEMENT.square * rng.normal())
+    off, shape = PRINCIPAL_POINTS.centred * width * rng.normal(size=2), np.exp(0.5 * REFINEMENT.square * rng.normal())
     true = [600.0 * shape, 600.0 / shape, 320.0 + off[0], 240.0 + off[1], -0.05, 0.0, 0.0, 0.0]
     start = np.array([620.0, 620.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0])
     return (QueryCamera("OPENCV", np.array(params), width, height) for params in (true, start))
