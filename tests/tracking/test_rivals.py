@@ -90,6 +90,7 @@ def test_a_prediction_says_nothing_where_the_camera_may_see_something_else():
 
 
 @pytest.mark.kernels
+@pytest.mark.compiled
 @pytest.mark.parametrize("says_nothing", [False, True])
 def test_a_frame_after_a_gap_that_does_not_stand_out_is_lost(monkeypatch, says_nothing):
     monkeypatch.setattr(verification, "stands_out", lambda *_: False)
