@@ -7,8 +7,7 @@ every problem
 ::
 
     repeat
-        linearise                                   H = sum w J^T J,  g = -sum w J^T r
-        repeat   solve (H + damping diag H) x = g, move, evaluate the cost
+        repeat   solve (H + damping diag H) x = g, move, linearise    H = sum w J^T J,  g = -sum w J^T r
         until the cost fell                         (damping * 10 after a failure, / 10 after a success)
     until it hardly fell
 
@@ -154,20 +153,6 @@ def _linearize(kind, shared, index, own, begin, end, active, x, B, cauchy, r, J,
     return cost
 
 
-@kernel
-def _evaluate(kind, shared, index, own, begin, end, active, x, B, cauchy, r, J, rows):
-    """Return the cost of one problem."""
-    cost = 0.0
-    for m in range(begin, end):
-        if active[m]:
-            _residuals(kind, shared, index[m], own, m, x, B, r, J)
-            square = 0.0
-            for k in range(len(rows)):
-                square += r[k] * r[k]
-            cost += _cost_of(square, cauchy)
-    return cost
-
-
 @loop
 def _solve_all(
     kind, shared, index, own, pointers, active, x, B, rules, cost, information, steps, converged, parameters, rows
@@ -176,37 +161,47 @@ def _solve_all(
     max_steps, tolerance, floor, cauchy = rules
     size = len(parameters)
     r, J, H, g = np.zeros(len(rows)), np.zeros((len(rows), size)), np.zeros((size, size)), np.zeros(size)
-    L, step, trial = np.zeros((size, size)), np.zeros(size), np.zeros(x.shape[1:])
+    L, step, trial, trial_frame = np.zeros((size, size)), np.zeros(size), np.zeros(x.shape[1:]), np.zeros(B.shape[1:])
+    trial_H, trial_g = np.zeros((size, size)), np.zeros(size)
     for n in range(len(pointers) - 1):
         begin, end, here, frame = pointers[n], pointers[n + 1], x[n], B[n]
         damping = FIRST_DAMPING
+        _frame(kind, here, frame)
+        before = _linearize(
+            kind, shared, index, own, begin, end, active, here, frame, cauchy, r, J, H, g, parameters, rows
+        )
         while steps[n] < max_steps:
             steps[n] += 1
-            _frame(kind, here, frame)
-            before = _linearize(
-                kind, shared, index, own, begin, end, active, here, frame, cauchy, r, J, H, g, parameters, rows
-            )
             done = better = False
             for _ in range(MAX_ATTEMPTS):
                 better = False
                 if solve_damped(H, g, damping, L, step, parameters):
                     _move(kind, here, frame, step, trial)
-                    after = _evaluate(kind, shared, index, own, begin, end, active, trial, frame, cauchy, r, J, rows)
+                    _frame(kind, trial, trial_frame)
+                    # Most steps are accepted, so the trial is linearised at once.
+                    after = _linearize(
+                        kind, shared, index, own, begin, end, active, trial, trial_frame, cauchy, r, J,
+                        trial_H, trial_g, parameters, rows,
+                    )  # fmt: skip
                     better = after <= before
                     done = after >= before * (1.0 - tolerance) - floor
                 if better:
                     for k in range(trial.size):
                         here.flat[k] = trial.flat[k]
+                    for k in range(trial_frame.size):
+                        frame.flat[k] = trial_frame.flat[k]
+                    H, trial_H, g, trial_g, before = trial_H, H, trial_g, g, after
                     damping = max(damping * 0.1, MIN_DAMPING)
                     break
                 damping *= 10.0
             if done or not better:
                 converged[n] = done
                 break
-        _frame(kind, here, frame)
-        cost[n] = _linearize(
-            kind, shared, index, own, begin, end, active, here, frame, 0.0, r, J, H, g, parameters, rows
-        )
+        if cauchy > 0.0:
+            before = _linearize(
+                kind, shared, index, own, begin, end, active, here, frame, 0.0, r, J, H, g, parameters, rows
+            )
+        cost[n] = before
         for a in range(size):
             for b in range(a + 1):
                 information[n, a, b] = information[n, b, a] = H[a, b]
