@@ -21,14 +21,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from groma._numba import kernel, loop
-from groma._typing import FloatArray
+from groma._typing import FloatArray, IntArray
 from groma.features.contract import SegmentDetector
 from groma.features.edge_fit import EDGES
 from groma.features.images import GrayImage, to_gray
 from groma.features.segments import Segments
-from groma.features.steps import BINS, ONE, REACH, TWO, beside, fit, merge, profile, two_steps, variance
-from groma.gates import gate, numbers
+from groma.features.steps import beside, fit, profiles, two_steps
+from groma.gates import gate
 
 
 @dataclass(frozen=True)
@@ -69,82 +68,6 @@ class CloseEdgeGates:
 CLOSE_EDGES = CloseEdgeGates()
 
 
-# -------------------------------------------------------------------------------------------------------- Kernels
-@kernel
-def _own_step(p, window):
-    """Index of the step that is the segment's: an ascent, high and near."""
-    own = p[2] * math.exp(-0.5 * (p[3] / window) ** 2)
-    other = p[5] * math.exp(-0.5 * (p[6] / window) ** 2)
-    return 5 if other > own else 2
-
-
-@loop
-def _one_step(whole, left, right, given, close, p, H):
-    """Fit one step to what is close to it, wherever it then is."""
-    log_blur, spread, noise2, misfit2, _, _ = given
-    p[0], p[1], p[2], p[3], p[4] = left, log_blur, right - left, 0.0, 0.0
-    for _ in range(2):
-        fit(whole, p, ONE, (log_blur, spread, noise2, misfit2, p[3], close), H)
-
-
-@loop
-def _second_step(bins, whole, given, alone, limits, p, H):
-    """Fit two steps; return the factor by which noise is larger, 0 where they do not explain more than one."""
-    max_shift, evidence, misfit = limits
-    if not two_steps(whole, given, max_shift, p):
-        return 0.0
-    together = fit(whole, p, TWO, given, H)
-    used = 0
-    for k in range(BINS):
-        used += 1 if whole[k, 0] > 0.0 else 0
-    scale = max(together / max(used - TWO + 2, 1), 1.0)
-    if together > misfit or not alone - together > evidence * scale:
-        return 0.0
-    fit(bins, p, TWO, given, H)
-    return scale
-
-
-@loop
-def _place_all(image, ends, fitted, gates, new_ends, added):
-    """Move the ends of segments to their step, and write the variance that a second one adds."""
-    blur, spread, any_spread, noise, model, close, displacement, max_shift, evidence, misfit = gates
-    bins, whole, H = np.zeros((2 * BINS, 4)), np.zeros((BINS, 4)), np.zeros((TWO, TWO))
-    p, x, unit = np.zeros(TWO), np.zeros(TWO), np.zeros(TWO)
-    for row in range(ends.shape[0]):
-        u1, v1, u2, v2 = ends[row, 0], ends[row, 1], ends[row, 2], ends[row, 3]
-        length = math.hypot(u2 - u1, v2 - v1)
-        if not fitted[row] or length < 2.0:
-            continue
-        profile(image, u1, v1, u2, v2, bins)
-        merge(bins, whole)
-        left, right = beside(whole, -1.0), beside(whole, 1.0)
-        if not right > left:
-            continue
-        given = math.log(blur), spread, noise**2, (model * (right - left)) ** 2, 0.0, REACH + 1.0
-        p[0], p[1], p[2], p[3], p[4] = left, given[0], right - left, 0.0, 0.0
-        alone = fit(whole, p, ONE, (given[0], any_spread, *given[2:]), H)
-        offset, tilt, scale = 0.0, 0.0, 0.0
-        if p[1] < given[0] + spread:  # a softer edge has no place of its own close to it
-            _one_step(whole, left, right, given, close, p, H)
-            # Its tilt is that of the fitted segment: places along it vote for that one by one.
-            offset = p[3] if p[2] > 0.0 and abs(p[3]) <= max_shift else 0.0
-        # No second step could gain more than all that is left.
-        if alone > evidence:
-            scale = _second_step(bins, whole, given, alone, (max_shift, evidence, misfit), p, H)
-        if scale > 0.0:
-            own = _own_step(p, max_shift)
-            share = displacement**2 / (displacement**2 + scale * variance(H, own + 1, unit, x))
-            offset += share * (p[own + 1] - offset)
-            tilt = p[own + 2] * displacement**2 / (displacement**2 + scale * variance(H, own + 2, unit, x))
-            added[row] = (1.0 - share) * displacement**2
-        first, second = offset - 0.5 * tilt, offset + 0.5 * tilt
-        if max(abs(first), abs(second)) <= max_shift:
-            dx, dy = (u2 - u1) / length, (v2 - v1) / length
-            new_ends[row, 0], new_ends[row, 1] = u1 - dy * first, v1 + dx * first
-            new_ends[row, 2], new_ends[row, 3] = u2 - dy * second, v2 + dx * second
-
-
-# --------------------------------------------------------------------------------------------------------- Public
 @dataclass(frozen=True)
 class CloseEdges:
     """A detector whose segments are then placed in the image as it is, also those that other edges lie close to.
@@ -186,8 +109,82 @@ def placed(
     sigma : (N,) float64
         Standard deviations; larger where an edge and its neighbour cannot be told apart.
     """
-    ends, added = np.ascontiguousarray(ends, dtype=np.float64), np.zeros(len(ends))
-    new_ends = ends.copy()
-    if len(ends):
-        _place_all(np.ascontiguousarray(image), ends, sigma < EDGES.unfitted_sigma, numbers(gates), new_ends, added)
+    ends, new_ends, added = (
+        np.ascontiguousarray(ends, dtype=np.float64),
+        np.array(ends, np.float64),
+        np.zeros(len(ends)),
+    )
+    length = np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1])
+    rows = np.flatnonzero((sigma < EDGES.unfitted_sigma) & (length >= 2.0))
+    whole, halves = profiles(np.ascontiguousarray(image), ends[rows])
+    left, right = beside(whole, -1), beside(whole, 1)
+    rises = right > left
+    rows, edges = rows[rises], _Profiles(whole[rises], halves[rises], left[rises], right[rises], gates)
+    offset, cost = edges.one_step()
+    some, own, own_variance = edges.two_steps(cost)
+    tilt, share = np.zeros(len(rows)), gates.displacement**2 / (gates.displacement**2 + own_variance)
+    offset[some] += share[:, 0] * (own[:, 0] - offset[some])
+    tilt[some] = share[:, 1] * own[:, 1]
+    added[rows[some]] = (1.0 - share[:, 0]) * gates.displacement**2
+    away = offset[:, None] + tilt[:, None] * [-0.5, 0.5]
+    near = (np.abs(away) <= gates.max_shift).all(axis=1)
+    rows, away = rows[near], away[near]
+    across = np.stack([ends[rows, 1] - ends[rows, 3], ends[rows, 2] - ends[rows, 0]], axis=1) / length[rows, None]
+    new_ends[rows] += (away[:, :, None] * across[:, None]).reshape(-1, 4)
     return new_ends, np.sqrt(sigma**2 + added)
+
+
+@dataclass(frozen=True)
+class _Profiles:
+    """Bins of segments, (N, BINS, 4) and (N, 2 BINS, 4), and grey levels beside them (N,), rising."""
+
+    whole: FloatArray
+    halves: FloatArray
+    left: FloatArray
+    right: FloatArray
+    gates: CloseEdgeGates
+
+    def one_step(self) -> tuple[FloatArray, FloatArray]:
+        """Offsets (N,) of single steps from their segments, and the costs (N,) of explaining all by one step."""
+        gates, weight, log_blur = self.gates, self._weight(self.whole), math.log(self.gates.blur)
+        start = np.zeros((len(weight), 5))
+        start[:, 0], start[:, 1], start[:, 2] = self.left, log_blur, self.right - self.left
+        alone = fit(self.whole, weight, start, log_blur, gates.any_spread)
+        offset = np.zeros(len(weight))
+        # A softer edge has no place of its own close to it.
+        sharp = np.flatnonzero(alone.states[:, 1] < log_blur + gates.blur_spread)
+        found, whole = start[sharp], self.whole[sharp]
+        for _ in range(2):
+            near = np.abs(whole[:, :, 2] - found[:, 3, None]) <= gates.close
+            found = fit(whole, weight[sharp] * near, found, log_blur, gates.blur_spread).states
+        # Its tilt is that of the fitted segment: places along it vote for that one by one.
+        offset[sharp] = np.where((found[:, 2] > 0.0) & (np.abs(found[:, 3]) <= gates.max_shift), found[:, 3], 0.0)
+        return offset, alone.cost
+
+    def two_steps(self, alone: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Segments that two steps explain, given the costs of one; offset and tilt of the own step, and variances."""
+        gates, weight, log_blur = self.gates, self._weight(self.whole), math.log(self.gates.blur)
+        # No second step could gain more than all that is left.
+        some = np.flatnonzero(alone > gates.evidence)
+        start, found = two_steps(self.whole[some], weight[some], log_blur, gates.max_shift)
+        some = some[found]
+        together = fit(self.whole[some], weight[some], start[found], log_blur, gates.blur_spread)
+        used = np.count_nonzero(self.whole[some, :, 0], axis=1)
+        scale = np.maximum(together.cost / np.maximum(used - 6, 1), 1.0)
+        told = (together.cost <= gates.misfit) & (alone[some] - together.cost > gates.evidence * scale)
+        some, scale = some[told], scale[told]
+        both = fit(
+            self.halves[some], self._weight(self.halves)[some], together.states[told], log_blur, gates.blur_spread
+        )
+        # What is not determined has a variance of a billion pixels.
+        covariance = np.linalg.inv(both.information + 1e-9 * np.eye(8))
+        variance = scale[:, None] * np.diagonal(covariance, axis1=1, axis2=2)
+        # The step that is the segment's: an ascent, high and near.
+        height = both.states[:, [2, 5]] * np.exp(-0.5 * (both.states[:, [3, 6]] / gates.max_shift) ** 2)
+        at = (np.array([3, 6])[height.argmax(axis=1)])[:, None] + np.arange(2)
+        return some, np.take_along_axis(both.states, at, 1), np.take_along_axis(variance, at, 1)
+
+    def _weight(self, bins: FloatArray) -> FloatArray:
+        """Inverse variances (N, K) of the mean grey levels of bins: noise, and what the model leaves out."""
+        number, misfit = bins[:, :, 0], self.gates.model * (self.right - self.left)[:, None]
+        return number / (self.gates.noise**2 + number * misfit**2)
