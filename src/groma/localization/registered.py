@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
-from typing import TypeVar
 
 import numpy as np
 
@@ -15,9 +13,7 @@ from groma.localization.map_index import MapIndex
 from groma.localization.placed import PlacedImage
 from groma.scene import Cameras, Frames, Images, LineObservations, PointObservations, Points, Rigs, Scene, Sensors
 from groma.scene.camera import CAMERA
-from groma.scene.table import Table
-
-_Table = TypeVar("_Table", bound=Table)
+from groma.scene.table import Table, joined
 
 
 def with_queries(scene: Scene, index: MapIndex, queries: Sequence[PlacedImage]) -> Scene:
@@ -94,19 +90,3 @@ def _seen(queries: Sequence[PlacedImage], number: IntArray, row: IntArray) -> di
 
 def _camera_key(one: PlacedImage) -> tuple[object, ...]:
     return (one.model, *one.params.tolist(), *one.size.tolist())
-
-
-def joined(table: _Table, other: _Table) -> _Table:
-    """Return the rows of two tables, one after the other."""
-    columns = {}
-    for item in fields(table):
-        first, second = getattr(table, item.name), getattr(other, item.name)
-        if isinstance(first, tuple):
-            columns[item.name] = (*first, *second)
-            continue
-        width = max(first.shape[1:], second.shape[1:])
-        parts = [np.zeros((len(part), *width), part.dtype) for part in (first, second)]
-        for part, values in zip(parts, (first, second), strict=True):
-            part[(slice(None), *(slice(0, size) for size in values.shape[1:]))] = values
-        columns[item.name] = np.concatenate(parts)
-    return type(table)(**columns)
