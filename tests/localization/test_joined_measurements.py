@@ -5,10 +5,12 @@ import numpy as np
 import pytest
 from worlds import CAMERA
 
+from groma.adjustment.terms.principal_points import near_the_middle
 from groma.geometry import quaternion, so3
 from groma.localization.joining.measurements import with_measurements_of
 from groma.scene import (
     CameraPositions,
+    Cameras,
     ControlPoints,
     Distances,
     Held,
@@ -144,6 +146,16 @@ def test_depths_are_of_the_points_that_the_same_features_show(joint):
     assert out.point_observations.image_idx[out.right_columns.observation_idx].tolist() == [4] * 4
     np.testing.assert_allclose(out.right_columns.baseline, 0.1)
     assert "1 point depth, 1 right column" in sentence
+
+
+def test_lenses_that_were_not_calibrated_stay_so(joint):
+    """Those of the second map that the first does not have; its own the first knows."""
+    own = Cameras.of([1, 2], ["SIMPLE_PINHOLE"] * 2, [[500.0, 320.0, 240.0]] * 2, [[640, 480]] * 2)
+    whole = Scene.from_images(own, [f"{k}.jpg" for k in range(6)], [0, 0, 0, 1, 1, 1], joint.cam_from_world)
+    second = near_the_middle(whole.subset(IMAGES))
+    first = Scene.from_images(own.take([0]), list("abc"), [0, 0, 0], joint.cam_from_world[:3])
+    out, sentence = with_measurements_of(whole, first, second, MOTION, IMAGES, FRESH)
+    assert out.principal_point_priors.camera_idx.tolist() == [1] and not sentence
 
 
 def test_what_is_held_is_left_out(joint):

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from groma._counted import counted
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.gates import gate
-from groma.scene import ControlPoints, PointDepths, Scene, Similarity
+from groma.scene import ControlPoints, PointDepths, PrincipalPointPriors, Scene, Similarity
 from groma.scene.survey import CHECK, CONTROL, UNKNOWN
 from groma.scene.table import Table, joined, moved_table, new_index_of
 
@@ -64,7 +64,11 @@ def with_measurements_of(
     points, of_points = _control_points(scene, moved_table(second.control_points, motion), hold)
     landmarks, rows = _measured_landmarks(scene, second, motion)
     new_index = _new_rows(scene, second, np.where(fresh, images, -1)) | rows | {"control_points": of_points}
-    tables = {"control_points": points, **landmarks}
+    tables = {
+        "control_points": points,
+        **landmarks,
+        "principal_point_priors": _lenses(scene, first.num_cameras, second, images),
+    }
     left = {"held": len(second.held)}
     for name in ("line_observations", "line_depths", "plane_observations"):
         table, here = moved_table(getattr(second, name), motion), getattr(scene, name)
@@ -136,6 +140,16 @@ def _new_rows(scene: Scene, second: Scene, images: IntArray) -> dict[str, IntArr
     if second.has_trivial_rigs:
         frames[second.images.frame_idx] = np.where(images >= 0, scene.images.frame_idx[images], -1)
     return rows | {"images": images, "frames": frames}
+
+
+def _lenses(scene: Scene, num_known: int, second: Scene, images: IntArray) -> PrincipalPointPriors:
+    """What is known of lenses whose calibration was not given: of the first ``num_known`` the first map says it."""
+    mine, theirs = scene.principal_point_priors, second.principal_point_priors
+    row = np.full(second.num_cameras, -1)
+    row[second.images.camera_idx] = scene.images.camera_idx[images]
+    row[row < num_known] = -1
+    theirs = theirs.renumbered({"cameras": row})[0]
+    return joined(mine, theirs.take(np.unique(theirs.camera_idx, return_index=True)[1]))
 
 
 def _measured_landmarks(
