@@ -7,6 +7,7 @@ import pytest
 
 import groma
 from groma.adjustment.parts import adjust_parts, write_parts
+from groma.adjustment.terms.principal_points import near_the_middle
 from groma.errors import InputError, OutputError
 from groma.evaluation import evaluate_poses
 from groma.factors.losses import Cauchy, Huber
@@ -90,6 +91,14 @@ def test_intrinsics_are_estimated_if_asked(scene, tmp_path):
     for path in result.paths:
         np.testing.assert_allclose(groma.read_scene(path).cameras.params, whole.cameras.params, rtol=1e-5)
     assert (whole.cameras.params[0, :2] != scene.cameras.params[0, :2]).all()
+
+
+@pytest.mark.parametrize("refine", [False, True])
+def test_a_calibration_that_was_not_given_is_held_and_that_is_said(scene, tmp_path, refine):
+    paths = write_parts(near_the_middle(scene.points_only()), tmp_path / "parts", observations=200)
+    result = adjust_parts(paths, tmp_path / "out", options=OPTIONS, refine_intrinsics=refine)
+    said = [sentence for sentence in result.warnings if "was not given" in sentence]
+    assert len(said) == 1 and ("--refine-intrinsics" in said[0]) == (not refine)
 
 
 def test_refuses_what_does_not_belong_together(scene, tmp_path):

@@ -117,6 +117,9 @@ def test_association():
     j, i = associate([0.004, 0.5, 1.02, 2.9951, 7.0], [0.0, 1.0, 2.0, 3.0], 0.01)
     assert (i.tolist(), j.tolist()) == ([0, 3], [0, 3])
     assert [len(rows) for rows in associate([], [1.0])] == [0, 0]
+    for wrong in (np.nan, -0.1):
+        with pytest.raises(InputError, match="max_time_difference must be a number of seconds"):
+            associate([0.0], [1.0], wrong)
     i, j = associate([1.0], [1.005], 0.01)
     assert (i.tolist(), j.tolist()) == ([0], [0])
 

@@ -87,3 +87,8 @@ def test_all_pairs_and_errors(segments):
     assert segment2.angle(segments[:5, None], segments[None, :7]).shape == (5, 7)
     with pytest.raises(ShapeError, match="segment must have shape"):
         segment2.length(np.zeros((3, 5)))
+
+
+def test_segments_apart():
+    first, second = np.array([[0.0, 1.0, 10.0, 3.0]]), np.array([[-5.0, 0.0, 20.0, 0.0], [50.0, 0.0, 60.0, 0.0]])
+    assert segment2.segments_apart(first, second).tolist() == [[3.0, np.inf]]

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from groma.adjustment.adjust import AdjustOptions
+from groma.adjustment.terms.principal_points import near_the_middle
 from groma.cli.main import run
 from groma.errors import InputError, OutputError
 from groma.evaluation import cabinet
@@ -20,13 +21,13 @@ from groma.geometry import so3
 from groma.io import read_scene, write_scene
 from groma.localization import extension
 from groma.localization.calibration import CalibrationChoice
-from groma.localization.extension import extended_model, in_world_of
+from groma.localization.extension import _with_new_lenses, extended_model, in_world_of
 from groma.localization.joining.merging import _line_sigma, _one_to_one, _same_lines, merged_model
 from groma.localization.localizer import Localizer
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.posed_model import gather_photographs
 from groma.mapping.result import MapResult
-from groma.scene import CameraPositions, Distances, LineObservations, Similarity
+from groma.scene import CameraPositions, Cameras, Distances, LineObservations, Scene, Similarity
 from groma.scene.landmarks import Lines
 from groma.scene.survey import Kind
 
@@ -92,6 +93,8 @@ def test_new_photographs_get_poses_and_points_with_the_others(maps, place, truth
     assert _off(scene, truth).max() < 0.2 and np.median(_off(scene, truth)[6:]) < 0.12
     np.testing.assert_array_equal(scene.cam_from_world[: len(HALVES["a"])], made.map.cam_from_world)
     assert scene.num_lines == 0 and scene.num_points > made.map.num_points
+    # They were taken with the camera of the map, which was calibrated.
+    assert scene.num_cameras == 1 and not len(scene.principal_point_priors)
     # Points tie the new photographs to those of the map and to each other.
     new = np.array([name in HALVES["b"] for name in scene.images.names])[scene.point_observations.image_idx]
     count = [np.bincount(scene.point_observations.point_idx[kind], minlength=scene.num_points) for kind in (~new, new)]
@@ -99,6 +102,18 @@ def test_new_photographs_get_poses_and_points_with_the_others(maps, place, truth
     assert {path.name: path.resolve() for path in made.folder.iterdir()} == {
         name: (place / half / name).resolve() for half, names in HALVES.items() for name in names
     }
+
+
+def test_calibrations_of_new_cameras_are_estimated_unless_they_are_a_given_one():
+    """The first camera of the map was calibrated, the second was not; of the new ones the first has its calibration."""
+    params = [[500.0, 320.0, 240.0], [600.0, 330.0, 250.0], [500.0, 320.0, 240.0], [700.0, 400.0, 300.0]]
+    cameras = Cameras.of([1, 2, 3, 4], ["SIMPLE_PINHOLE"] * 4, params, [[640, 480]] * 3 + [[800, 600]])
+    poses = np.tile([0, 0, 0, 1, 0, 0, 0.0], (4, 1))
+    scene = Scene.from_images(cameras, list("abcd"), np.arange(4), poses)
+    told = near_the_middle(scene).principal_point_priors.take([1])
+    before = Scene.from_images(cameras.take([0, 1]), ["a", "b"], np.arange(2), poses[:2], principal_point_priors=told)
+    found = _with_new_lenses(scene, before).principal_point_priors
+    assert found.camera_idx.tolist() == [1, 3] and found.pixel.tolist() == [[320.0, 240.0], [400.0, 300.0]]
 
 
 def test_photographs_that_show_only_new_ones_follow_in_turn(maps, place, truth, tmp_path, monkeypatch):

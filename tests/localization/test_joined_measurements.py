@@ -5,15 +5,22 @@ import numpy as np
 import pytest
 from worlds import CAMERA
 
+from groma.adjustment.terms.principal_points import near_the_middle
 from groma.geometry import quaternion, so3
 from groma.localization.joining.measurements import with_measurements_of
 from groma.scene import (
     CameraPositions,
+    Cameras,
     ControlPoints,
     Distances,
     Held,
     KnownDirections,
+    LineDepths,
+    LineObservations,
+    Lines,
     Marks,
+    PlaneObservations,
+    Planes,
     PointDepths,
     PointObservations,
     Points,
@@ -141,6 +148,44 @@ def test_depths_are_of_the_points_that_the_same_features_show(joint):
     assert "1 point depth, 1 right column" in sentence
 
 
+def test_lenses_that_were_not_calibrated_stay_so(joint):
+    """Those of the second map that the first does not have; its own the first knows."""
+    own = Cameras.of([1, 2], ["SIMPLE_PINHOLE"] * 2, [[500.0, 320.0, 240.0]] * 2, [[640, 480]] * 2)
+    whole = Scene.from_images(own, [f"{k}.jpg" for k in range(6)], [0, 0, 0, 1, 1, 1], joint.cam_from_world)
+    second = near_the_middle(whole.subset(IMAGES))
+    first = Scene.from_images(own.take([0]), list("abc"), [0, 0, 0], joint.cam_from_world[:3])
+    out, sentence = with_measurements_of(whole, first, second, MOTION, IMAGES, FRESH)
+    assert out.principal_point_priors.camera_idx.tolist() == [1] and not sentence
+
+
 def test_what_is_held_is_left_out(joint):
     out, sentence = joined(joint, second_of(joint).replace(held=Held([Kind.IMAGE], [1])))
     assert not len(out.held) and sentence.endswith("left out: 1 held object.")
+
+
+def test_lines_and_planes_that_cameras_measured_go_along(joint):
+    """With their landmarks, for the photographs that the first map lacks."""
+    hesse, ends = (
+        np.array([[0.0, 0, 1, -5], [1.0, 0, 0, -2]]),
+        np.array([[[0.0, 0, 5], [1, 0, 5]], [[0, 0, 4], [0, 1, 4.0]]]),
+    )
+    whole = joint.replace(planes=Planes([3, 7], hesse), lines=Lines.through(ends))
+    second = whole.subset(IMAGES, 0).transformed(MOTION.inverse())
+    segments = np.arange(8.0).reshape(2, 4)
+    second = second.replace(
+        line_observations=LineObservations([2, 0], [1, 0], segments, [1.0, 1.0]),
+        line_depths=LineDepths([0, 1], [[0.1, 0.2], [0.3, 0.4]], np.full((2, 2), 0.01), [0.5, 0.5]),
+        plane_observations=PlaneObservations(
+            [0, 3], [0, 1], [[0.0, 0, 1, -1], [0.0, 1, 0, -1]], np.stack([np.eye(3)] * 2)
+        ),
+    )
+    out, sentence = joined(whole, second)
+    assert sentence.endswith("left out: 1 line depth, 1 plane observation.")  # of the image that the first map knows
+    assert out.planes.ids.tolist() == [3, 7, 8, 9] and out.num_lines == 4
+    np.testing.assert_allclose(out.planes.hesse[3], hesse[1], atol=1e-12)
+    np.testing.assert_allclose(out.lines.segments[2:], ends, atol=1e-12)
+    row = int(out.line_depths.observation_idx[0])
+    assert (out.line_observations.image_idx[row], out.line_observations.line_idx[row]) == (4, 3)
+    np.testing.assert_allclose(out.line_depths.inverse_depth, [[0.1 / 0.4, 0.2 / 0.4]])
+    assert (out.plane_observations.image_idx.tolist(), out.plane_observations.plane_idx.tolist()) == ([5], [3])
+    np.testing.assert_allclose(out.plane_observations.plane_in_cam, [[0, 1, 0, -0.4]])

@@ -21,7 +21,7 @@ from groma.mapping.depth.unit import own_units
 from groma.mapping.map import map_images
 from groma.mapping.options import MapOptions
 from groma.mapping.plan import planned_stages
-from groma.scene import Frames, Images, Rigs, Sensors, Similarity
+from groma.scene import Frames, Images, PlaneObservations, Planes, Rigs, Sensors, Similarity
 
 SIGMA = 0.01  # units of the world, of a depth map
 
@@ -235,3 +235,31 @@ def test_the_command_says_the_unit(corner, small, tmp_path, capsys):
     written = read_scene(tmp_path / "out" / "scene.npz")
     assert evaluate_poses(written, corner[1]).alignment.scale == pytest.approx(1.0, abs=2e-3)
     assert len(written.line_depths) and len(written.point_depths)
+
+
+def test_what_cameras_measured_of_lines_and_planes_goes_along_when_a_map_is_mapped_again(corner, mapped, tmp_path):
+    """Depths of the same segments, and planes: the same ones where they are found, one that nothing shows as it is."""
+    scene, hidden = mapped.scene, np.array([[0.6, 0.0, 0.8, -0.3]])
+    planes = np.concatenate([scene.planes.hesse, hidden])
+    model = scene.replace(planes=Planes(np.arange(len(planes)) + 1, planes))
+    image, plane = (grid.ravel() for grid in np.meshgrid(np.arange(scene.num_images), np.arange(len(planes))))
+    poses = scene.cam_from_world[image]
+    normal = quaternion.rotate(poses[:, :4], planes[plane, :3])
+    measured = np.column_stack([normal, planes[plane, 3] - (normal * poses[:, 4:]).sum(axis=1)])
+    noise = np.tile(np.diag([1e2, 1e2, 1 / SIGMA]), (len(image), 1, 1))  # a hundredth, and the noise of depths
+    model = model.replace(plane_observations=PlaneObservations(image, plane, measured, noise))
+    again = map_images(corner[0], tmp_path / "work", model, MapOptions(min_confidence=0.0))
+    assert not [sentence for sentence in again.warnings if "plane observations" in sentence]
+    depths = [
+        {tuple(segment): q for segment, q in zip(one.line_observations.segment[rows].round(3), q, strict=True)}
+        for one in (scene, again.scene)
+        for rows, q in [(one.line_depths.observation_idx, one.line_depths.inverse_depth)]
+    ]
+    both = depths[0].keys() & depths[1].keys()
+    assert len(both) > 0.9 * len(depths[0])
+    np.testing.assert_allclose([depths[1][key] for key in both], [depths[0][key] for key in both], rtol=1e-6)
+    # Of the planes of the walls there are no two.
+    found = again.scene.plane_observations
+    assert len(found) == len(image) and again.scene.num_planes == len(planes)
+    near = np.abs(again.scene.planes.hesse @ (hidden[0] * [1, 1, 1, 0]))
+    assert (near > 0.999).sum() == 1

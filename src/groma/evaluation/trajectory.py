@@ -230,7 +230,17 @@ def associate(
     -------
     (K,) and (K,) int
         Rows of ``first`` and of ``second``, in order of time.
+
+    Raises
+    ------
+    InputError
+        If the largest difference is negative or no number.
     """
+    if not max_time_difference >= 0.0:
+        raise InputError(
+            f"max_time_difference must be a number of seconds, not negative; got {max_time_difference}. Half of the "
+            "time between two poses is usual."
+        )
     a, b = np.asarray(first, float), np.asarray(second, float)
     if len(b) > len(a):
         return _nearest(a, b, max_time_difference)

@@ -174,3 +174,16 @@ def endpoint_distance(first: FloatArray, second: FloatArray, oriented: bool = Fa
 def midpoint_distance(first: FloatArray, second: FloatArray) -> FloatArray:
     """Distance (...) of the midpoints in pixels."""
     return norm(midpoint(first) - midpoint(second))
+
+
+def segments_apart(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Largest distance (n, m) of the ends of segments (n, 4) from the lines of others (m, 4); infinite where the middle
+    of the first is not beside the second.
+    """
+    query, ends = first.reshape(-1, 2, 2), second.reshape(-1, 2, 2)
+    step = ends[:, 1] - ends[:, 0]
+    length = np.linalg.norm(step, axis=1)
+    away = query[:, None] - ends[None, :, :1]
+    across = np.abs(away @ np.array([[0.0, -1.0], [1.0, 0.0]]) @ (step / length[:, None])[None, :, :, None])[..., 0]
+    along = (away.mean(axis=2) * step).sum(axis=-1) / length**2
+    return np.where((along > 0) & (along < 1), across.max(axis=2), np.inf)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from groma._counted import counted
+from groma.adjustment.terms.principal_points import near_the_middle
 from groma.errors import InputError
 from groma.evaluation.alignment import align_poses
 from groma.localization.calibration import CalibrationChoice
@@ -22,6 +23,7 @@ from groma.localization.posed_model import gather_photographs, with_photographs
 from groma.localization.run import localize_images
 from groma.mapping.result import MapResult
 from groma.scene import Scene, Similarity
+from groma.scene.table import joined
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,12 +102,23 @@ def extended_model(
         waiting = {one.name: waiting[one.name] for one in found if one.status != "localized"}
         paths = [*localizer.files, *(files[one.name] for one in placed)]
         scene = with_photographs(localizer.scene, localizer.index, placed, paths, say)
+        scene = _with_new_lenses(scene, localizer.scene)
         gather_photographs(folder, dict(zip(scene.images.names, paths, strict=True)))
         if not waiting:
             break
         # What shows nothing of the map may show what the photographs do that are in it now.
         localizer = Localizer(scene, folder, options=localizer.options, progress=say)
     return ExtendedModel(scene, folder, before, tuple(done[name] for name in files), num_given - len(files))
+
+
+def _with_new_lenses(scene: Scene, before: Scene) -> Scene:
+    """Return a scene in which calibrations of new cameras are estimated, but for those taken from a given one."""
+    table, known = near_the_middle(scene).principal_point_priors, before.cameras
+    given = np.setdiff1d(np.arange(len(known)), before.principal_point_priors.camera_idx)
+    calibrated = {(known.models[row], *known.params_of(row).tolist()) for row in given.tolist()}
+    lens = [(scene.cameras.models[row], *scene.cameras.params_of(row).tolist()) for row in table.camera_idx.tolist()]
+    new = (table.camera_idx >= len(known)) & np.array([one not in calibrated for one in lens], bool)
+    return scene.replace(principal_point_priors=joined(before.principal_point_priors, table.take(new)))
 
 
 def _without_known(files: Mapping[str, Path], known: Sequence[Path]) -> dict[str, Path]:

@@ -20,11 +20,12 @@ from groma.execution import map_work
 from groma.localization.features import DescribedPoints, find_corners, find_points
 from groma.localization.map_index import MapIndex, Progress
 from groma.localization.placed import PlacedImage
-from groma.localization.registered import joined, with_queries
+from groma.localization.registered import with_queries
 from groma.localization.retrieval import VladRetrieval
 from groma.localization.triangulation import triangulate_features
 from groma.mapping.photographs import read_gray
 from groma.scene import Keypoints, PointObservations, Points, Scene
+from groma.scene.table import joined
 
 #: Images that the features of an image are matched with (cost: time).
 _NEIGHBORS = 12
@@ -56,7 +57,7 @@ def with_photographs(
     InputError
         If an image cannot be read, or no point is seen by a new photograph.
     """
-    both = with_queries(scene, index, [_without_landmarks(one) for one in placed]).points_only()
+    both = with_queries(scene, index, [_without_landmarks(one) for one in placed])
     features = map_work(_find, list(files), partial(say, "finding points in images"))
     made = triangulate_features(both, features, _pairs(features), partial(say, "placing points"))
     image = np.repeat(np.arange(len(features)), [len(one) for one in features])

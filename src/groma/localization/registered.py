@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
-from typing import TypeVar
 
 import numpy as np
 
@@ -15,13 +13,13 @@ from groma.localization.map_index import MapIndex
 from groma.localization.placed import PlacedImage
 from groma.scene import Cameras, Frames, Images, LineObservations, PointObservations, Points, Rigs, Scene, Sensors
 from groma.scene.camera import CAMERA
-from groma.scene.table import Table
-
-_Table = TypeVar("_Table", bound=Table)
+from groma.scene.table import Table, joined
 
 
 def with_queries(scene: Scene, index: MapIndex, queries: Sequence[PlacedImage]) -> Scene:
-    """Return a map with queries as images after its own, with cameras of their own, and the points that they see.
+    """Return a map with queries as images after its own, and the points that they see.
+
+    A query with the calibration of the map's one camera of its size was taken with that; others have new cameras.
 
     Raises
     ------
@@ -45,30 +43,43 @@ def with_queries(scene: Scene, index: MapIndex, queries: Sequence[PlacedImage]) 
 
 
 def _images(scene: Scene, queries: Sequence[PlacedImage]) -> dict[str, Table]:
-    """Cameras, each alone on a rig, frames and images of queries."""
-    distinct = {_camera_key(one): one for one in queries}
-    which = np.array([list(distinct).index(_camera_key(one)) for one in queries])
-    every, count = np.arange(len(distinct)), len(queries)
+    """Frames and images of queries, and the cameras that the map lacks, each alone on a rig."""
+    place = _own_cameras(scene)
+    fresh = {_camera_key(one): one for one in queries if _camera_key(one) not in place}
+    every, count = np.arange(len(fresh)), len(queries)
+    sizes = len(scene.cameras), len(scene.rigs), len(scene.sensors)
+    place |= {key: tuple(size + number for size in sizes) for number, key in enumerate(fresh)}
+    camera, rig, sensor = np.array([place[_camera_key(one)] for one in queries]).T
     taken = max(int(ids.max(initial=0)) for ids in (scene.cameras.ids, scene.rigs.ids, scene.sensors.sensor_ids))
-    ids = taken + 1 + every
-    models, params, sizes = zip(*((one.model, one.params, one.size) for one in distinct.values()), strict=True)
+    ids, cameras = taken + 1 + every, [(one.model, one.params, one.size) for one in fresh.values()]
     sensors = Sensors(
         len(scene.rigs) + every, np.full(len(every), CAMERA), ids, len(scene.cameras) + every,
         np.tile([0, 0, 0, 1, 0, 0, 0.0], (len(every), 1)), np.ones(len(every), int), np.ones(len(every), int),
     )  # fmt: skip
     first = 1 + int(max(scene.images.ids.max(initial=0), scene.frames.ids.max(initial=0)))
     number = first + np.arange(count)
-    frames = Frames(number, len(scene.rigs) + which, np.stack([one.pose for one in queries]))
-    return {
-        "cameras": Cameras.of(ids, models, params, sizes),
-        "rigs": Rigs(ids),
-        "sensors": sensors,
-        "frames": frames,
-        "images": Images(
-            number, _names(scene, queries), len(scene.cameras) + which, scene.num_frames + np.arange(count),
-            len(scene.sensors) + which,
-        ),
-    }  # fmt: skip
+    tables: dict[str, Table] = {
+        "frames": Frames(number, rig, np.stack([one.pose for one in queries])),
+        "images": Images(number, _names(scene, queries), camera, scene.num_frames + np.arange(count), sensor),
+    }
+    if fresh:
+        tables |= {"cameras": Cameras.of(ids, *zip(*cameras, strict=True)), "rigs": Rigs(ids), "sensors": sensors}
+    return tables
+
+
+def _own_cameras(scene: Scene) -> dict[tuple[object, ...], tuple[int, ...]]:
+    """Camera, rig and sensor by calibration, of cameras alone on their rigs that no other of their size is beside."""
+    cameras, table = scene.cameras, scene.sensors
+    sizes = list(zip(cameras.width.tolist(), cameras.height.tolist(), strict=True))
+    alone = np.bincount(table.rig_idx, minlength=len(scene.rigs))[table.rig_idx] == 1
+    alone &= np.bincount(table.camera_idx[table.kind == CAMERA], minlength=len(cameras))[table.camera_idx] == 1
+    out = {}
+    for sensor in np.flatnonzero(alone & (table.kind == CAMERA)).tolist():
+        camera = int(table.camera_idx[sensor])
+        if sizes.count(sizes[camera]) == 1:
+            key = (cameras.models[camera], *cameras.params_of(camera).tolist(), *sizes[camera])
+            out[key] = camera, int(table.rig_idx[sensor]), sensor
+    return out
 
 
 def _names(scene: Scene, queries: Sequence[PlacedImage]) -> tuple[str, ...]:
@@ -94,19 +105,3 @@ def _seen(queries: Sequence[PlacedImage], number: IntArray, row: IntArray) -> di
 
 def _camera_key(one: PlacedImage) -> tuple[object, ...]:
     return (one.model, *one.params.tolist(), *one.size.tolist())
-
-
-def joined(table: _Table, other: _Table) -> _Table:
-    """Return the rows of two tables, one after the other."""
-    columns = {}
-    for item in fields(table):
-        first, second = getattr(table, item.name), getattr(other, item.name)
-        if isinstance(first, tuple):
-            columns[item.name] = (*first, *second)
-            continue
-        width = max(first.shape[1:], second.shape[1:])
-        parts = [np.zeros((len(part), *width), part.dtype) for part in (first, second)]
-        for part, values in zip(parts, (first, second), strict=True):
-            part[(slice(None), *(slice(0, size) for size in values.shape[1:]))] = values
-        columns[item.name] = np.concatenate(parts)
-    return type(table)(**columns)

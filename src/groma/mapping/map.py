@@ -40,6 +40,13 @@ from groma.features.registry import DETECTORS
 from groma.features.segments import Segments
 from groma.gates import gate
 from groma.io.depth_maps import DepthMaps
+from groma.mapping.carried.measured import (
+    carried_depths,
+    not_carried,
+    ready_to_map,
+    with_measured_lines,
+    with_measured_planes,
+)
 from groma.mapping.checkpoint_files import ADJUSTED, LINE_MAP, SCENE, SEGMENTS
 from groma.mapping.checkpoints import Stages, digest, digest_files, stage
 from groma.mapping.depth.segments import with_line_depths
@@ -57,7 +64,7 @@ from groma.mapping.read_rows import adjust_read_rows, mapped_as_measured, read_b
 from groma.mapping.refine_points import refine_points
 from groma.mapping.result import SCENES_OF_RESULT, MapResult, result_of
 from groma.mapping.start import start_of
-from groma.mapping.structure.find import LandmarkNoise, find_structure, landmark_noise
+from groma.mapping.structure.find import LandmarkNoise, detect_structure, landmark_noise
 from groma.mapping.structure.flatness import surface_noise_px
 from groma.mapping.surveyed import adjust_with_survey, tied
 from groma.mapping.with_depths import find_segment_depths, with_depths
@@ -139,7 +146,8 @@ def map_images(
     folder = Path(images)
     files = image_files(folder)
     names = [path.relative_to(folder).as_posix() for path in files]
-    model = None if model is None else model.points_only()  # lines and planes of a finished map are found anew
+    given = model
+    model = None if model is None else ready_to_map(model)
     if model is not None and options.camera_model is not None:
         model = model.replace(cameras=model.cameras.with_model(options.camera_model))
         options = dataclasses.replace(options, refine_intrinsics=options.refine_intrinsics is not False)
@@ -153,12 +161,13 @@ def map_images(
     with one_blas_thread(), work_with(options.threads), Stages(Path(work), key, options, say) as stages:
         placed = start_of(folder, names, model, stages)
         start = placed.scene
+        bare = start.keep(lines=[])  # those that are left have measured depths, which new segments take over
         by_rows, segments = read_by_rows(start, options, depth), None
         if by_rows or options.refine_intrinsics or options.refine_points or survey or depth is not None:
-            points = stages.run(adjust_read_rows if by_rows else adjust_points, start)
+            points = stages.run(adjust_read_rows if by_rows else adjust_points, bare)
         else:  # the cameras stay as they are, and more is not needed to find segments
-            found = (find_segments, folder, start, line_matches)
-            points, segments = stages.run_beside("adjusting points", (adjust_points, start), *found, given=line_matches)
+            found = (find_segments, folder, bare, line_matches)
+            points, segments = stages.run_beside("adjusting points", (adjust_points, bare), *found, given=line_matches)
         if options.refine_points:
             points = stages.run(measure_points, folder, points)
         in_place = tied(start, points, survey) if survey else None
@@ -171,13 +180,14 @@ def map_images(
         if segments is None:
             segments = stages.run(find_segments, folder, points, line_matches, given=line_matches)
         matches = matches_for(options, folder, points, segments, line_matches)
-        beside = None
+        beside = None if by_rows else carried_depths(start, segments)
         if depths is not None and depth is not None:
             beside = stages.run(find_segment_depths, points, segments, depth, depths.measured)
         seen = taken_at_once(points, segments)
         result = map_segments(seen.scene, seen.segments, matches, stages, neighbors_for(options, folder), beside)
-        result = mapped_as_measured(result, seen, stages)
+        result = with_measured_lines(mapped_as_measured(result, seen, stages), start)
     left_out = images_left_out(names, (model or start).images.names, model is not None)
+    left_out = (*left_out, *not_carried(given or Scene(), result.scene))
     result = dataclasses.replace(
         result,
         start=start,
@@ -306,7 +316,7 @@ def adjust_jointly(scene: Scene, weighted: AdjustOptions, options: MapOptions, s
 @stage("structure", SCENE)
 def find_planes(scene: Scene, noise: LandmarkNoise, options: MapOptions, say: StageProgress) -> Scene:
     """Planes, common directions and structural relations."""
-    return find_structure(scene, options.structure, progress=say, noise=noise)
+    return with_measured_planes(detect_structure(scene, options.structure, progress=say, noise=noise), scene)
 
 
 @stage("adjusted", ADJUSTED)

@@ -28,6 +28,7 @@ def without_unused(scene: Scene, *others: Scene) -> tuple[Scene, ...]:
     }
     on_plane = np.bincount(on["point_on_plane"], minlength=scene.num_planes)
     on_plane += 2 * np.bincount(on["line_on_plane"], minlength=scene.num_planes)
+    on_plane[scene.plane_observations.plane_idx] += _MIN_ON_PLANE  # measured in a camera, which determines it
     along = np.bincount(on["line_along_direction"], minlength=scene.num_directions)
     along[scene.held.idx[scene.held.kind == Kind.DIRECTION]] += _MIN_ALONG  # such as the vertical
     kept = {

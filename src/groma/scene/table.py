@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,7 @@ from groma.errors import InputError, ShapeError
 if TYPE_CHECKING:
     from groma.scene.similarity import Similarity
 
+SomeTable = TypeVar("SomeTable", bound="Table")
 #: What measurements may refer to by kind and index: tables of the scene, by the number of their kind.
 OBJECTS = ("images", "control_points", "lines", "planes", "points", "directions")
 #: How far a stored quaternion may be from length one.
@@ -347,3 +348,19 @@ def check_quaternions(name: str, poses: FloatArray) -> None:
             f"{name} must begin with a unit quaternion [qx qy qz qw]; row {row} has {poses[row, :4].tolist()}. "
             "Divide it by its length."
         )
+
+
+def joined(table: SomeTable, other: SomeTable) -> SomeTable:
+    """Return the rows of two tables, one after the other."""
+    columns = {}
+    for item in fields(table):
+        first, second = getattr(table, item.name), getattr(other, item.name)
+        if isinstance(first, tuple):
+            columns[item.name] = (*first, *second)
+            continue
+        width = max(first.shape[1:], second.shape[1:])
+        parts = [np.zeros((len(part), *width), part.dtype) for part in (first, second)]
+        for part, values in zip(parts, (first, second), strict=True):
+            part[(slice(None), *(slice(0, size) for size in values.shape[1:]))] = values
+        columns[item.name] = np.concatenate(parts)
+    return type(table)(**columns)

@@ -233,8 +233,17 @@ def _facts(scene: Scene, options: AssemblyOptions, made: Assembly) -> dict[str, 
         "metric": scene.has_scale,
         "gauge": gauge_of(scene, options) if options.gauge == "auto" else options.gauge,
         "squares": {kind: [float(values.sum()), len(values)] for kind, values in squares.items()},
-        "notes": list(made.notes),
+        "notes": [*made.notes, *_held_lenses(scene, options)],
     }
+
+
+def _held_lenses(scene: Scene, options: AssemblyOptions) -> list[str]:
+    """Say that parts hold what a whole scene estimates of a calibration that was not given."""
+    count = len(scene.principal_point_priors)
+    if not count or options.refine_principal_point:
+        return []
+    rest = "" if options.refine_intrinsics else " and the rest, which --refine-intrinsics (refine_intrinsics) estimates"
+    return [f"The calibration of {counted(count, 'cameras')} was not given. Parts hold the principal points{rest}."]
 
 
 def _held_besides(made: Assembly) -> set[str]:

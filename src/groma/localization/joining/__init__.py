@@ -2,6 +2,6 @@
 """Two maps of one place become one.
 
 What comes in are two maps with their photographs. :mod:`merging` finds the motion between their worlds by what
-photographs of one show of the other, and makes a model of all photographs, to be mapped; :mod:`kept_lines` puts back
-the lines that this mapping did not find anew. What goes out is one map in the world of the first.
+photographs of one show of the other, and makes a model of all photographs, to be mapped, with what was measured of both
+(:mod:`measurements`). What goes out is one map in the world of the first.
 """

@@ -16,16 +16,13 @@ from scipy.spatial import KDTree
 from groma._counted import counted
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.gates import gate
-from groma.localization.registered import joined
-from groma.scene import ControlPoints, PointDepths, Scene, Similarity
+from groma.scene import ControlPoints, PointDepths, PrincipalPointPriors, Scene, Similarity
 from groma.scene.survey import CHECK, CONTROL, UNKNOWN
-from groma.scene.table import moved_table
+from groma.scene.table import Table, joined, moved_table, new_index_of
 
 #: Measurements that hold in every world, and in that of their map.
 _ANYWHERE = ("marks", "distances", "camera_motions")
 _IN_THE_WORLD = ("camera_positions", "camera_poses", "known_planes", "known_directions", "pose_priors")
-#: Of lines and planes, which are mapped anew; and what is held where its map has it.
-_LEFT_OUT = ("line_depths", "plane_observations", "held")
 _MEASURED = ("role", "measured", "covariance")
 
 
@@ -65,9 +62,20 @@ def with_measurements_of(
         hold = _is_same_world(first, second, motion)
         motion = Similarity() if hold else motion
     points, of_points = _control_points(scene, moved_table(second.control_points, motion), hold)
-    new_index = _new_rows(scene, second, np.where(fresh, images, -1)) | {"control_points": of_points}
-    tables = {"control_points": points}
-    left = {name: len(getattr(second, name)) for name in _LEFT_OUT}
+    landmarks, rows = _measured_landmarks(scene, second, motion)
+    new_index = _new_rows(scene, second, np.where(fresh, images, -1)) | rows | {"control_points": of_points}
+    tables = {
+        "control_points": points,
+        **landmarks,
+        "principal_point_priors": _lenses(scene, first.num_cameras, second, images),
+    }
+    left = {"held": len(second.held)}
+    for name in ("line_observations", "line_depths", "plane_observations"):
+        table, here = moved_table(getattr(second, name), motion), getattr(scene, name)
+        kept, rows = table.renumbered(new_index)
+        new_index[name] = _after(here, rows, len(table))
+        tables[name], left[name] = joined(here, kept), len(table) - len(kept)
+    del left["line_observations"]  # of lines without depths
     for name in (*_IN_THE_WORLD, *_ANYWHERE):
         table = moved_table(getattr(second, name), motion)
         kept = table.renumbered(new_index)[0] if hold or name in _ANYWHERE else table.take([])
@@ -132,6 +140,35 @@ def _new_rows(scene: Scene, second: Scene, images: IntArray) -> dict[str, IntArr
     if second.has_trivial_rigs:
         frames[second.images.frame_idx] = np.where(images >= 0, scene.images.frame_idx[images], -1)
     return rows | {"images": images, "frames": frames}
+
+
+def _lenses(scene: Scene, num_known: int, second: Scene, images: IntArray) -> PrincipalPointPriors:
+    """What is known of lenses whose calibration was not given: of the first ``num_known`` the first map says it."""
+    mine, theirs = scene.principal_point_priors, second.principal_point_priors
+    row = np.full(second.num_cameras, -1)
+    row[second.images.camera_idx] = scene.images.camera_idx[images]
+    row[row < num_known] = -1
+    theirs = theirs.renumbered({"cameras": row})[0]
+    return joined(mine, theirs.take(np.unique(theirs.camera_idx, return_index=True)[1]))
+
+
+def _measured_landmarks(
+    scene: Scene, second: Scene, motion: Similarity
+) -> tuple[dict[str, Table], dict[str, IntArray]]:
+    """Lines and planes with those of the second map that its cameras measured, and the rows of these; -1 for others."""
+    tables, rows = {}, {}
+    of_lines = second.line_observations.line_idx[second.line_depths.observation_idx]
+    for name, measured in (("lines", of_lines), ("planes", second.plane_observations.plane_idx)):
+        chosen, here, own = np.unique(measured), getattr(scene, name), moved_table(getattr(second, name), motion)
+        ids = here.ids.max(initial=0) + 1 + np.arange(len(chosen))
+        tables[name], rows[name] = joined(here, own.take(chosen).replace(ids=ids)), _after(here, chosen, len(own))
+    return tables, rows
+
+
+def _after(here: Table, chosen: IntArray, size: int) -> IntArray:
+    """New rows of ``size`` old ones, of which the chosen ones follow those of a table; -1 for others."""
+    row = new_index_of(chosen, size)
+    return np.where(row >= 0, row + len(here), -1)
 
 
 def _same_observations(scene: Scene, second: Scene, images: IntArray, fresh: BoolArray) -> IntArray:

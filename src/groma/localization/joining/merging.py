@@ -20,8 +20,8 @@ from groma.estimators.motion.estimation import Motion, estimate_motion
 from groma.estimators.motion.groups import Kind
 from groma.estimators.motion.matches import LandmarkMatches
 from groma.gates import gate
+from groma.geometry.segment2 import segments_apart
 from groma.geometry.so3 import hat
-from groma.localization.joining.kept_lines import segments_apart, with_lines_of
 from groma.localization.joining.measurements import with_measurements_of
 from groma.localization.localizer import LocalizedImage, Localizer
 from groma.localization.map_images import content_digest
@@ -31,6 +31,7 @@ from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.verdict import moved as way_between
 from groma.localization.posed_model import gather_photographs, with_photographs
+from groma.mapping.carried.kept_lines import with_lines_of
 from groma.mapping.noise.landmarks import project_points
 from groma.scene import Scene, Similarity
 

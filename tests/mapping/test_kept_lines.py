@@ -5,13 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds import CAMERA
 
 from groma.geometry import quaternion, so3
-from groma.localization.joining.kept_lines import segments_apart, with_lines_of
+from groma.localization.pose.camera import QueryCamera
+from groma.mapping.carried.kept_lines import with_lines_of
 from groma.scene import LineObservations, Scene, Similarity
 from groma.scene.landmarks import Lines
 
+CAMERA = QueryCamera("PINHOLE", np.array([600.0, 610.0, 330.0, 235.0]), 640, 480)
 NAMES = tuple(f"{number}.jpg" for number in range(6))
 WORLDS = (
     Similarity(2.5, so3.exp(np.array([0.3, -0.5, 1.0])), np.array([1.0, 2.0, 3.0])),
@@ -68,8 +69,3 @@ def test_lines_follow_the_images_that_see_them(truth):
     pixel = CAMERA.project(poses[2], out.lines.segments[0])
     # The scale is that of all three cameras, so that only the depth is off, and the image is not.
     np.testing.assert_allclose(pixel.ravel(), own.line_observations.segment[0], atol=1e-6)
-
-
-def test_segments_apart():
-    first, second = np.array([[0.0, 1.0, 10.0, 3.0]]), np.array([[-5.0, 0.0, 20.0, 0.0], [50.0, 0.0, 60.0, 0.0]])
-    assert segments_apart(first, second).tolist() == [[3.0, np.inf]]

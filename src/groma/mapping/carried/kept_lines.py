@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Lines of the maps that a joint map was made of, which it did not find anew: they are kept, as their images show them.
+"""Lines of the maps that a map was made of, which it did not find anew: they are kept, as their images show them.
 
 A map of ``groma track`` has lines that photographs alone do not determine, because depth was measured too. Such a line
 goes along with the images that see it: it stays where it was in their cameras, in the mean.
@@ -15,9 +15,10 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.evaluation.alignment import align_poses
 from groma.geometry import quaternion
-from groma.localization.registered import joined
-from groma.scene import LineObservations, Scene
+from groma.geometry.segment2 import segments_apart
+from groma.scene import LineObservations, Scene, Similarity
 from groma.scene.landmarks import Lines
+from groma.scene.table import joined, moved_table
 
 
 def with_lines_of(
@@ -53,8 +54,8 @@ def _with_lines(
     """Add lines of one map; ``taken`` are rows of lines that are there already. Also returns the row of each, or -1."""
     place = {name: row for row, name in enumerate(scene.images.names)}
     image = np.array([place.get(name, -1) for name in called], np.int64)
-    both, seen = np.flatnonzero(image >= 0), one.line_observations
-    seen = seen.take(np.flatnonzero(image[seen.image_idx] >= 0))
+    both, chosen = np.flatnonzero(image >= 0), np.flatnonzero(image[one.line_observations.image_idx] >= 0)
+    seen = one.line_observations.take(chosen)
     if len(both) < 2 or not len(seen):
         return out, taken
     scale = align_poses(one.cam_from_world[both], scene.cam_from_world[image[both]]).scale
@@ -70,7 +71,15 @@ def _with_lines(
     added = LineObservations(
         image[seen.image_idx[used]], row[seen.line_idx[used]], seen.segment[used], seen.sigma[used]
     )
-    return out.replace(lines=joined(out.lines, lines), line_observations=joined(out.line_observations, added)), row
+    observation = np.full(one.num_line_observations, -1)
+    observation[chosen[used]] = out.num_line_observations + np.arange(len(used))
+    moved = Similarity(1.0 if one.has_scale and scene.has_scale else scale)
+    depths = moved_table(one.line_depths, moved).renumbered({"line_observations": observation})[0]
+    return out.replace(
+        lines=joined(out.lines, lines),
+        line_observations=joined(out.line_observations, added),
+        line_depths=joined(out.line_depths, depths),
+    ), row
 
 
 def _moved(scene: Scene, one: Scene, seen: LineObservations, image: IntArray, scale: float) -> FloatArray:
@@ -93,16 +102,3 @@ def _is_there(table: LineObservations, seen: LineObservations, image: IntArray, 
         if len(rows) and len(theirs):
             there[rows] = (segments_apart(seen.segment[rows], theirs) < near).any(axis=1)
     return there
-
-
-def segments_apart(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Largest distance (n, m) of the ends of segments (n, 4) from the lines of others (m, 4); infinite where the middle
-    of the first is not beside the second.
-    """
-    query, ends = first.reshape(-1, 2, 2), second.reshape(-1, 2, 2)
-    step = ends[:, 1] - ends[:, 0]
-    length = np.linalg.norm(step, axis=1)
-    away = query[:, None] - ends[None, :, :1]
-    across = np.abs(away @ np.array([[0.0, -1.0], [1.0, 0.0]]) @ (step / length[:, None])[None, :, :, None])[..., 0]
-    along = (away.mean(axis=2) * step).sum(axis=-1) / length**2
-    return np.where((along > 0) & (along < 1), across.max(axis=2), np.inf)
