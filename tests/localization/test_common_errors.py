@@ -135,7 +135,7 @@ def test_queries_are_as_uncertain_as_the_map(calibration):
         found = refine(camera, world.matches, world.start(), limit, lens, gathered=True)
         own = 0 if of_map else None
         noise = found.covariance(world.matches)
-        common = errors.of_query(found, world.matches, world.landmarks, own)
+        common = errors.of_query(found, world.landmarks, own)
         knowing.append(world.normalised(found.pose, noise + common))
         plain.append(world.normalised(found.pose, noise))
     assert 0.76 < np.mean(knowing) < 1.24, (np.mean(knowing), np.mean(plain))
@@ -160,12 +160,12 @@ def test_what_a_query_is_off_by_follows_the_map():
             step[6 * frames : 6 * frames + 2] = 0.1
         alone = replace(errors, covariance=np.outer(step, step))
         shared = direction == "lens of both"
-        told = alone.of_query(found, world.matches, world.landmarks, 0 if shared else None)
+        told = alone.of_query(found, world.landmarks, 0 if shared else None)
         moved = _moved(world, step)
         camera = replace(world.camera, params=world.camera.params + shared * step[6 * frames :])
         other = refine(camera, moved, found.pose, max_errors(moved), gathered=True)
         way = se3.log(se3.compose(other.pose[None], se3.inverse(found.pose[None])))[0]
-        size = np.sqrt(np.trace(alone.of_query(found, world.matches, world.landmarks)))
+        size = np.sqrt(np.trace(alone.of_query(found, world.landmarks)))
         assert size > 1e-6
         # Robust weights and covariances of landmarks, which move as well, change it by some hundredths of what the map
         # does; a query with the calibration of the map moves by a tenth of that.
@@ -205,5 +205,5 @@ def test_exact_calibrations_leave_errors_of_poses():
     assert posed is not None and both is not None
     assert posed.parameters == 0 and both.parameters == 4
     found = refine(world.camera, world.matches, world.start(), max_errors(world.matches), gathered=True)
-    less, more = (one.of_query(found, world.matches, world.landmarks) for one in (posed, both))
+    less, more = (one.of_query(found, world.landmarks) for one in (posed, both))
     assert 0.0 < np.trace(less) < np.trace(more)

@@ -95,7 +95,7 @@ def test_queries_are_as_uncertain_as_the_poses():
         errors, _ = common_errors(scene, scene, (1.0, 1.0), (False, False))
         assert errors is not None
         noise = found.covariance(matches)
-        common = errors.of_query(found, matches, (landmark, np.zeros(0, np.int64)))
+        common = errors.of_query(found, (landmark, np.zeros(0, np.int64)))
         error = se3.log(se3.compose(true[None], se3.inverse(found.pose[None])))[0]
         knowing.append(error @ np.linalg.solve(noise + common, error) / 6.0)
         plain.append(error @ np.linalg.solve(noise, error) / 6.0)

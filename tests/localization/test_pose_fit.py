@@ -20,7 +20,7 @@ from groma.localization.pose.lens import lens_step
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pose_fit import fit_pose
 from groma.localization.pose.pose_problem import problem_of
-from groma.localization.pose.refinement import landmark_weights, refine
+from groma.localization.pose.refinement import refine, weighed
 from groma.solver.options import SolverOptions
 
 #: Ends where a step gains nothing in double precision.
@@ -67,7 +67,7 @@ def test_the_cost_is_least_where_a_fit_ends(loss, which, free):
         near = rng.uniform(size=40) < 0.8, rng.uniform(size=15) < 0.8
         problem = problem_of(CAMERA, matches, world.pose)
         lens = free_lens(CAMERA, which)
-        ended = fit_pose(problem, landmark_weights(problem, matches), near, loss, TO_THE_END, lens)
+        ended = fit_pose(problem, weighed(problem, matches)[0], near, loss, TO_THE_END, lens)
         pose = ended.pose
         camera = QueryCamera("PINHOLE", ended.params, 640, 480) if free else CAMERA
         least = cost_of(matches, near, loss, pose, camera)
@@ -96,7 +96,7 @@ def test_what_is_not_near_has_no_part():
         world.segments2d[12:] += shift
         moved = Matches(world.points2d, world.points3d, world.segments2d, world.segments3d).with_sigma(0.7)
         problem = problem_of(CAMERA, moved, world.pose)
-        weights = landmark_weights(problem, moved)
+        weights = weighed(problem, moved)[0]
         found.append(fit_pose(problem, weights, near, Cauchy(1.5), TO_THE_END).pose)
     assert found[0] == pytest.approx(found[1], abs=1e-10)
 

@@ -246,11 +246,11 @@ class Localizer:
             around = nearest_images(self.index, images, agreeing, self.options.gates.near)
             return shown_of(self.scene, self.index, self._again, around, best, seen, alike, self.options.lines)
 
-        def common(best: Refined, used: Matches) -> FloatArray:
+        def common(best: Refined) -> FloatArray:
             if self._common is None:
                 return np.zeros((6, 6))
             landmarks = last[0].points[:, 1], last[0].lines[:, 1]
-            return self._common.of_query(best, used, landmarks, self._own_camera(best.camera))
+            return self._common.of_query(best, landmarks, self._own_camera(best.camera))
 
         matches = found.matches(part, self.scene, self.index)
         mirror = MirrorImage(

@@ -36,9 +36,7 @@ from groma.factors.losses import GemanMcClure
 from groma.gates import gate
 from groma.localization.errors.held_poses import held_poses
 from groma.localization.errors.views import Views, views_of
-from groma.localization.pose.matches import Matches
-from groma.localization.pose.pose_problem import problem_of
-from groma.localization.pose.refinement import Refined, landmark_weights, last_scale
+from groma.localization.pose.refinement import Refined, last_scale
 from groma.scene import Relations, Scene
 from groma.solver.covariance.marginals import Covariances
 
@@ -112,14 +110,14 @@ class CommonErrors:
         return self.points.motion.shape[2] - 6
 
     def of_query(
-        self, refined: Refined, matches: Matches, landmarks: tuple[IntArray, IntArray], camera: int | None = None
+        self, refined: Refined, landmarks: tuple[IntArray, IntArray], camera: int | None = None
     ) -> FloatArray:
         """Return what they add to the covariance (6, 6) of the pose of a query.
 
         Parameters
         ----------
-        refined, matches
-            The pose, and what it was fitted to.
+        refined
+            The pose.
         landmarks
             Points (N,) and lines (M,) of the map that the matches are of.
         camera
@@ -130,15 +128,17 @@ class CommonErrors:
         r = np.concatenate([refined.points.value[kept[0]], refined.lines.value[kept[1]]])
         weight = (1.0 + (r**2).sum(axis=1) / last_scale(len(r)) ** 2) ** -2
         pull = weight[:, None, None] * np.swapaxes(J, 1, 2)
-        some = matches.take(*kept)
-        one = problem_of(refined.camera, some, refined.pose, refined.lens is not None)
+        place = [np.cumsum(kept[0]) - 1, np.cumsum(kept[1]) - 1 + int(kept[0].sum())]
         K = np.zeros((len(self.covariance), J.shape[2]))
-        for part, white in zip(one.parts, landmark_weights(one, some), strict=True):
+        one = refined.one
+        for part, white in zip(one.parts, refined.weights, strict=True):
             lines = part.kind == "lines"
-            own, row = (self.lines if lines else self.points), part.row + lines * some.num_points
+            own, agree = (self.lines if lines else self.points), kept[int(lines)][part.row]
+            matched = part.row[agree]
+            row, seen = place[int(lines)][matched], landmarks[int(lines)][matched]
             wanted = {part.kind[:-1]: own.motion.shape[1], "intrinsics": len(one.params)}
-            by_own, by_lens = np.split(white @ one.records(part, wanted)[..., :-1], [own.motion.shape[1]], axis=2)
-            seen = landmarks[int(lines)][kept[int(lines)]][part.row]
+            record = white[agree] @ one.records(part, wanted)[agree][..., :-1]
+            by_own, by_lens = np.split(record, [own.motion.shape[1]], axis=2)
             _pull_views(own.begin, own.seen, own.motion, seen, pull[row] @ by_own, 6 * self.frames, K)
             if camera is not None and self.parameters and part.has_lens:
                 first = 6 * self.frames + camera * self.parameters

@@ -22,7 +22,7 @@ from groma.localization.pose.hypotheses import max_errors, propose, straightened
 from groma.localization.pose.lens import lens_step
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pieces import cells_elsewhere
-from groma.localization.pose.refinement import Refined, cells_of, fitted, refine
+from groma.localization.pose.refinement import Refined, cells_of, fitted_at, refine
 from groma.localization.pose.verdict import (
     Evidence,
     Status,
@@ -193,7 +193,7 @@ def pose_from_matches(
     mirror: MirrorQuestions | None = None,
     expected: Callable[[Refined], tuple[tuple[float, float], float]] | None = None,
     enough: int = 0,
-    common: Callable[[Refined, Matches], FloatArray] | None = None,
+    common: Callable[[Refined], FloatArray] | None = None,
 ) -> AbsolutePose:
     """Estimate a pose as :func:`estimate_absolute_pose` does.
 
@@ -228,14 +228,14 @@ def pose_from_matches(
         used, lens = guided(best), options.lens_of(camera)
         errors = _errors(used, options)
         best = refine(best.camera, used, best.pose, errors, lens, gathered=True)
-        own = fitted(best.camera, matches, best.pose, errors, lens)
+        own = fitted_at(own.one.at(best.pose, best.camera.params), best.camera, matches, errors, lens)
         first = evidence_of(own, matches, places)
     if first.agree < enough:
         return _failed(camera, matches)
     other = None if rival_of is None else _rival(matches, rival_of[0], options, places, rival_of[1])
     covariance = best.covariance(used)
     if common is not None and np.isfinite(covariance).all():
-        covariance = covariance + common(best, used)
+        covariance = covariance + common(best)
     distance = median_distance(best.pose, _seen(used, best))
     verdict = judge(best, covariance, distance, first, None if other is None else other[1])
     if verdict.status == "localized":

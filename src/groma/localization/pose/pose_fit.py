@@ -121,6 +121,13 @@ def fit_pose(
     return here.one
 
 
+def full_step(one: OnePose, weights: Sequence[FloatArray], loss: Loss, lens: FreeLens) -> FloatArray | None:
+    """Return the undamped step (6 + k,) of a pose and a lens by all matches; None where they do not determine it."""
+    here = _sum(one, weights, [np.ones(len(part.row), bool) for part in one.parts], loss, lens)
+    H = here.total[:-1, :-1]
+    return _step(H, here.total[:-1, -1], np.diag(H), 0.0)
+
+
 @dataclass(frozen=True, eq=False)
 class _Sum:
     """A pose, the cost there, matches that cannot be evaluated, and products of weighted derivatives and residuals."""

@@ -42,11 +42,11 @@ from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.free_lens import FreeLens
 from groma.localization.pose.gates import REFINEMENT
 from groma.localization.pose.matches import Matches, nearest_claims
-from groma.localization.pose.one_pose import OnePose, Part
+from groma.localization.pose.one_pose import OnePose
 from groma.localization.pose.pose_fit import FINELY, ROUGHLY, fit_pose
 from groma.localization.pose.pose_problem import problem_of
 from groma.localization.pose.records import times
-from groma.localization.pose.residuals import Residuals, residual_squares_of, residuals
+from groma.localization.pose.residuals import Residuals, residuals
 
 #: Information of scaled unknowns below which they are not determined.
 _SINGULAR = 1e-10
@@ -54,8 +54,8 @@ _SINGULAR = 1e-10
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
 @loop
-def _widen(image, derivative, covariance, rows, out):
-    """Inverse roots of the noise of the image and of the landmarks together."""
+def _weigh(image, record, covariance, rows, out, square):
+    """Inverse roots of the noise of the image and of the landmarks together, and squared residuals in its units."""
     size = covariance.shape[1]
     for n in range(image.shape[0]):
         determinant = image[n, 0, 0] * image[n, 1, 1] - image[n, 0, 1] * image[n, 1, 0]
@@ -66,15 +66,18 @@ def _widen(image, derivative, covariance, rows, out):
             first, second = 0.0, 0.0
             for j in range(size):
                 value = covariance[rows[n], i, j]
-                first += value * derivative[n, 0, j]
-                second += value * derivative[n, 1, j]
-            uu += derivative[n, 0, i] * first
-            uv += derivative[n, 0, i] * second
-            vv += derivative[n, 1, i] * second
+                first += value * record[n, 0, j]
+                second += value * record[n, 1, j]
+            uu += record[n, 0, i] * first
+            uv += record[n, 0, i] * second
+            vv += record[n, 1, i] * second
         root = np.sqrt(uu)
         rest = np.sqrt(vv - uv * uv / uu)
         out[n, 0, 0], out[n, 0, 1] = 1.0 / root, 0.0
         out[n, 1, 0], out[n, 1, 1] = -uv / (uu * rest), 1.0 / rest
+        r, s = record[n, 0, size], record[n, 1, size]
+        if r != 0.0 or s != 0.0:  # what cannot be evaluated is zero
+            square[rows[n]] = (r / root) ** 2 + (out[n, 1, 0] * r + s / rest) ** 2
 
 
 # ----------------------------------------------------------------------------------------------------------- Public
@@ -93,6 +96,9 @@ class Refined:
     #: Noise that the residuals show, in units of what was stated, and the squared residual that agrees.
     sigma0: float
     limit: float
+    #: The problem at this pose, and the inverse noise of its factors.
+    one: OnePose
+    weights: tuple[FloatArray, ...]
     #: What is estimated of the lens.
     lens: FreeLens | None = None
 
@@ -230,8 +236,7 @@ def refine(
     ]
     near: tuple[BoolArray, BoolArray] | None = None
     for round_ in range(REFINEMENT.rounds + 1):
-        weights = landmark_weights(one, matches)
-        squares = residual_squares_of(one, weights, matches)
+        weights, squares = weighed(one, matches)
         wide = gathered and round_ == 0
         before, near = near, (wide | (squares[0] <= limits[0]), wide | (squares[1] <= limits[1]))
         last = round_ == REFINEMENT.rounds or (before is not None and all(map(np.array_equal, near, before)))
@@ -243,7 +248,7 @@ def refine(
         camera, one = estimated, moved
         if last:
             break
-    return _fitted(one, camera, matches, max_error, lens)
+    return fitted_at(one, camera, matches, max_error, lens)
 
 
 def _agreeing(squares: tuple[FloatArray, FloatArray]) -> int:
@@ -266,17 +271,18 @@ def fitted(
     lens: FreeLens | None = None,
 ) -> Refined:
     """Say which matches agree with a pose as it is; parameters as of :func:`refine`."""
-    return _fitted(problem_of(camera, matches, pose, lens is not None), camera, matches, max_error, lens)
+    return fitted_at(problem_of(camera, matches, pose, lens is not None), camera, matches, max_error, lens)
 
 
-def _fitted(
+def fitted_at(
     one: OnePose,
     camera: QueryCamera,
     matches: Matches,
     max_error: tuple[float, float],
-    lens: FreeLens | None,
+    lens: FreeLens | None = None,
 ) -> Refined:
-    weights = landmark_weights(one, matches)
+    """Return what :func:`fitted` does, where the problem at the pose is known."""
+    weights = weighed(one, matches)[0]
     directions = None if lens is None else lens.directions(one.params)
     points = residuals(one, weights, "points", matches.num_points, directions)
     lines = residuals(one, weights, "lines", matches.num_lines, directions)
@@ -287,7 +293,7 @@ def _fitted(
         nearest_claims(claim, found.square, inside)
         for claim, found, inside in zip(matches.claims(), (points, lines), near, strict=True)
     ]
-    return Refined(one.pose, camera, points, lines, agree[0], agree[1], sigma0, limit, lens)
+    return Refined(one.pose, camera, points, lines, agree[0], agree[1], sigma0, limit, one, weights, lens)
 
 
 def _in_front(camera: QueryCamera, matches: Matches, pose: FloatArray) -> BoolArray:
@@ -307,22 +313,21 @@ def _in_front(camera: QueryCamera, matches: Matches, pose: FloatArray) -> BoolAr
     return np.einsum("ni,ni->n", start, ray) * square > np.einsum("ni,ni->n", start, way) * along
 
 
-def landmark_weights(one: OnePose, matches: Matches) -> list[FloatArray]:
-    """Inverse noise (n, 2, 2) of the factors of a problem that holds that of their landmarks, too, as they are seen
-    from where its pose is.
+def weighed(one: OnePose, matches: Matches) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, FloatArray]]:
+    """Return the inverse noise (n, 2, 2) of the factors of a problem, which holds that of their landmarks, too, as they
+    are seen from where its pose is; and squared residuals (N,) of points and (M,) of lines in its units, infinite where
+    a match has no image.
     """
     covariances = {"points": matches.point_covariance, "lines": matches.line_covariance}
-    return [_widened(one, part, covariances[part.kind]) for part in one.parts]
-
-
-def _widened(one: OnePose, part: Part, covariance: FloatArray) -> FloatArray:
-    image = np.broadcast_to(times(part.factor.sqrt_information, np.eye(2)[None]), (len(part.row), 2, 2))
-    if not covariance.any():
-        return np.ascontiguousarray(image)
-    J = one.records(part, {part.kind[:-1]: covariance.shape[1]})
-    sqrt_information = np.empty((len(part.row), 2, 2))
-    _widen(image, J, covariance, part.row, sqrt_information)
-    return sqrt_information
+    squares = {"points": np.full(matches.num_points, np.inf), "lines": np.full(matches.num_lines, np.inf)}
+    weights = []
+    for part in one.parts:
+        image = np.broadcast_to(times(part.factor.sqrt_information, np.eye(2)[None]), (len(part.row), 2, 2))
+        covariance, weight = covariances[part.kind], np.empty((len(part.row), 2, 2))
+        record = one.records(part, {part.kind[:-1]: covariance.shape[1]})
+        _weigh(image, record, covariance, part.row, weight, squares[part.kind])
+        weights.append(weight)
+    return tuple(weights), (squares["points"], squares["lines"])
 
 
 def _noise(found: tuple[Residuals, Residuals], matches: Matches, max_error: tuple[float, float]) -> float:

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.localization.pose.matches import Matches
 from groma.localization.pose.one_pose import OnePose
 
 
@@ -61,12 +60,3 @@ def residuals(
             by_pose[rows[seen], :, 6:] = white[seen][:, :, 6:-1] @ lens
         spread[rows] = 1.0 / np.abs(weight[:, 0, 0] * weight[:, 1, 1] - weight[:, 0, 1] * weight[:, 1, 0])
     return Residuals(value, by_pose, spread)
-
-
-def residual_squares_of(one: OnePose, weights: Sequence[FloatArray], matches: Matches) -> tuple[FloatArray, FloatArray]:
-    """Squared whitened residuals (N,) of points and (M,) of lines; infinite where a match has no image."""
-    found = {"points": np.full(matches.num_points, np.inf), "lines": np.full(matches.num_lines, np.inf)}
-    for part, weight in zip(one.parts, weights, strict=True):
-        square = ((weight @ one.records(part, {}))[..., 0] ** 2).sum(axis=1)
-        found[part.kind][part.row] = np.where(square > 0.0, square, np.inf)  # what cannot be evaluated is zero
-    return found["points"], found["lines"]
