@@ -7,7 +7,8 @@ are one pixel apart, and a tenth of a pixel where they are four. The displacemen
 that no residual tells it. Here the grey levels around a fitted segment are explained by steps under a common blur, that
 of usual photographs unless the profile says otherwise (:mod:`groma.features.steps`).
 
-One step is fitted to the pixels close to it; an edge that is softer than photographs are stays where it is.
+One step is fitted to the pixels close to it. The edge stays where it is if it is softer than photographs are, or if the
+step lies within a standard deviation of it: the segment's own place then varies less from view to view.
 Where two steps explain all of the profile, and a likelihood ratio asks for the second, the place is that of the
 segment's own step of the two, weighed against the displacements that the first fit may still have; what is then unknown
 is added to the variance of the segment.
@@ -105,7 +106,7 @@ def _second_step(bins, whole, given, alone, limits, p, H):
 
 
 @loop
-def _place_all(image, ends, fitted, gates, new_ends, added):
+def _place_all(image, ends, sigma, unfitted_sigma, gates, new_ends, added):
     """Move the ends of segments to their step, and write the variance that a second one adds."""
     blur, spread, any_spread, noise, model, close, displacement, max_shift, evidence, misfit = gates
     bins, whole, H = np.zeros((2 * BINS, 4)), np.zeros((BINS, 4)), np.zeros((TWO, TWO))
@@ -113,7 +114,7 @@ def _place_all(image, ends, fitted, gates, new_ends, added):
     for row in range(ends.shape[0]):
         u1, v1, u2, v2 = ends[row, 0], ends[row, 1], ends[row, 2], ends[row, 3]
         length = math.hypot(u2 - u1, v2 - v1)
-        if not fitted[row] or length < 2.0:
+        if not sigma[row] < unfitted_sigma or length < 2.0:
             continue
         profile(image, u1, v1, u2, v2, bins)
         merge(bins, whole)
@@ -127,7 +128,8 @@ def _place_all(image, ends, fitted, gates, new_ends, added):
         if p[1] < given[0] + spread:  # a softer edge has no place of its own close to it
             _one_step(whole, left, right, given, close, p, H)
             # Its tilt is that of the fitted segment: places along it vote for that one by one.
-            offset = p[3] if p[2] > 0.0 and abs(p[3]) <= max_shift else 0.0
+            # Less than it is known to is noise, and noise differs from view to view.
+            offset = p[3] if p[2] > 0.0 and sigma[row] < abs(p[3]) <= max_shift else 0.0
         # No second step could gain more than all that is left.
         if alone > evidence:
             scale = _second_step(bins, whole, given, alone, (max_shift, evidence, misfit), p, H)
@@ -189,5 +191,6 @@ def placed(
     ends, added = np.ascontiguousarray(ends, dtype=np.float64), np.zeros(len(ends))
     new_ends = ends.copy()
     if len(ends):
-        _place_all(np.ascontiguousarray(image), ends, sigma < EDGES.unfitted_sigma, numbers(gates), new_ends, added)
+        image, sigma = np.ascontiguousarray(image), np.ascontiguousarray(sigma, dtype=np.float64)
+        _place_all(image, ends, sigma, EDGES.unfitted_sigma, numbers(gates), new_ends, added)
     return new_ends, np.sqrt(sigma**2 + added)
