@@ -7,7 +7,8 @@ are one pixel apart, and a tenth of a pixel where they are four. The displacemen
 that no residual tells it. Here the grey levels around a fitted segment are explained by steps under a common blur, that
 of usual photographs unless the profile says otherwise (:mod:`groma.features.steps`).
 
-One step is fitted to the pixels close to it; an edge that is softer than photographs are stays where it is.
+One step is fitted to the pixels close to it. The edge stays where it is if it is softer than photographs are, or if the
+step lies within a standard deviation of it: the segment's own place then varies less from view to view.
 Where two steps explain all of the profile, and a likelihood ratio asks for the second, the place is that of the
 segment's own step of the two, weighed against the displacements that the first fit may still have; what is then unknown
 is added to the variance of the segment.
@@ -119,7 +120,8 @@ def placed(
     whole, halves = profiles(np.ascontiguousarray(image), ends[rows])
     left, right = beside(whole, -1), beside(whole, 1)
     rises = right > left
-    rows, edges = rows[rises], _Profiles(whole[rises], halves[rises], left[rises], right[rises], gates)
+    rows = rows[rises]
+    edges = _Profiles(whole[rises], halves[rises], left[rises], right[rises], sigma[rows], gates)
     offset, cost = edges.one_step()
     some, own, own_variance = edges.two_steps(cost)
     tilt, share = np.zeros(len(rows)), gates.displacement**2 / (gates.displacement**2 + own_variance)
@@ -136,12 +138,13 @@ def placed(
 
 @dataclass(frozen=True)
 class _Profiles:
-    """Bins of segments, (N, BINS, 4) and (N, 2 BINS, 4), and grey levels beside them (N,), rising."""
+    """Bins of segments, (N, BINS, 4) and (N, 2 BINS, 4), grey levels beside them (N,), rising, and deviations (N,)."""
 
     whole: FloatArray
     halves: FloatArray
     left: FloatArray
     right: FloatArray
+    sigma: FloatArray
     gates: CloseEdgeGates
 
     def one_step(self) -> tuple[FloatArray, FloatArray]:
@@ -158,7 +161,10 @@ class _Profiles:
             near = np.abs(whole[:, :, 2] - found[:, 3, None]) <= gates.close
             found = fit(whole, weight[sharp] * near, found, log_blur, gates.blur_spread).states
         # Its tilt is that of the fitted segment: places along it vote for that one by one.
-        offset[sharp] = np.where((found[:, 2] > 0.0) & (np.abs(found[:, 3]) <= gates.max_shift), found[:, 3], 0.0)
+        # Less than it is known to is noise, and noise differs from view to view.
+        away = np.abs(found[:, 3])
+        moved = (found[:, 2] > 0.0) & (away <= gates.max_shift) & (away > self.sigma[sharp])
+        offset[sharp] = np.where(moved, found[:, 3], 0.0)
         return offset, alone.cost
 
     def two_steps(self, alone: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
