@@ -242,7 +242,7 @@ def test_color_and_depth_by_number(tmp_path):
         image(tmp_path / f"color/{number}.jpg", 10 * number)
     for number in (2, 1):
         image(tmp_path / f"depth/d_{number:04d}.png", 1000 * number, dtype=np.uint16)
-    with pytest.raises(InputError, match="no camera is known"):
+    with pytest.raises(InputError, match="No camera is known"):
         open_sequence(tmp_path)
     sequence = open_sequence(tmp_path, camera="50 50 32 24")
     frames = list(sequence)
@@ -284,7 +284,7 @@ def test_color_and_depth_that_do_not_belong_together(tmp_path):
 def test_image_folder(tmp_path):
     for number in (1, 2, 10):
         image(tmp_path / f"img{number}.png", number)
-    with pytest.raises(InputError, match="no camera is known"):
+    with pytest.raises(InputError, match="No camera is known"):
         open_sequence(tmp_path)
     sequence = open_sequence(tmp_path, camera="50 50 32 24")
     assert (sequence.kind, sequence.reference) == ("mono", None)

@@ -25,7 +25,7 @@ class Termination(Enum):
     COST_CONVERGED = (
         "cost_converged",
         True,
-        "Converged: the cost hardly falls any more (by less than function_tolerance in a step, taken or foreseen).",
+        "Converged: a step changes the cost by less than function_tolerance.",
     )
     GRADIENT_CONVERGED = (
         "gradient_converged",

@@ -32,7 +32,7 @@ RATE = 30.0
 
 #: What to do where no camera is known.
 NO_CAMERA = (
-    "no camera is known for {path}. Pass one (--camera), such as 'fx fy cx cy', or the name of a file with a line of "
+    "No camera is known for {path}. Pass one (--camera), such as 'fx fy cx cy', or the name of a file with a line of "
     "COLMAP's cameras.txt, or put it into cameras.txt beside the images."
 )
 
