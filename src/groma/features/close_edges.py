@@ -29,7 +29,6 @@ from groma.features.segments import Segments
 from groma.features.steps import beside, fit, profiles, two_steps
 from groma.gates import gate
 
-
 #: Places in halved photographs were compared with those at full size. *Much alike*: on these and on scenes not chosen
 #: on, the root mean square of the difference is at most a quarter larger than at the default.
 _CHOSEN = "chosen on halved photographs of Strecha's scenes"

@@ -103,6 +103,3 @@ def adjust_similarity_graph(
     solution = solve(Problem({"cameras": cameras}, [factor]), options or SolverOptions())
     squares = squared_norms(factor, solution.problem.variables)
     return SimilarityGraphResult(solution["cameras"], squares, solution.report)
-
-
-__all__ = ["SimilarityGraphResult", "SimilarityMotions", "adjust_similarity_graph"]
