@@ -101,16 +101,6 @@ def test_line_directions_with_elongated_noise():
     assert (found.label >= 0).mean() > 0.9
 
 
-def test_groups_and_candidates():
-    rng = np.random.default_rng(5)
-    normals, factors = noisy_normals(rng, FRAME[:2], 40, 0, 1e-3)
-    groups = np.concatenate([np.zeros(40, int), np.arange(40) % 4])
-    options = replace(EXACT, min_groups=2)
-    found = directions_from_normals(normals, factors, options, groups, FRAME + 1e-3)
-    assert len(found) == 1
-    assert angles(found.vectors, FRAME[1:2]).max() < 2e-3
-
-
 def test_orthogonal_pairs_need_certainty():
     directions = np.array([[1, 0, 0], [0, 1, 0], [0, np.sin(0.1), np.cos(0.1)]])
     certain, vague = np.zeros((3, 3, 3)), np.broadcast_to(0.1**2 * np.eye(3), (3, 3, 3))
@@ -184,7 +174,7 @@ def test_how_far_ends_deviate_is_estimated():
     truth = np.repeat(FRAME[:2], 100, axis=0)
     directions = unit(truth + off[:, None] * rng.normal(size=(200, 3)))
     found = directions_from_lines(
-        directions, np.tile(1e-4**2 * np.eye(3), (200, 1, 1)), DirectionOptions(level=0.99), None, turned
+        directions, np.tile(1e-4**2 * np.eye(3), (200, 1, 1)), DirectionOptions(level=0.99), turned
     )
     assert len(found) == 2
     assert np.median(found.deviation) == pytest.approx(0.3, rel=0.4)
@@ -233,7 +223,7 @@ def test_nearly_parallel_lines_are_told_from_parallel_ones():
         truth[:16] = unit(truth[:16] + opened)
         directions = unit(truth + 0.4 * turned[:, None] * rng.normal(size=(60, 3)))
         found = directions_from_lines(
-            directions, np.tile(5e-4**2 * np.eye(3), (60, 1, 1)), DirectionOptions(level=0.99), None, turned
+            directions, np.tile(5e-4**2 * np.eye(3), (60, 1, 1)), DirectionOptions(level=0.99), turned
         )
         along = (found.label == 0) & (found.probability > 0.9)
         wrong, right = wrong + along[:16].sum(), right + along[16:].sum()

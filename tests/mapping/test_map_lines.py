@@ -19,7 +19,7 @@ from groma.mapping.lines.hypotheses.directions import depth_ratios
 from groma.mapping.lines.hypotheses.proposals import Proposer, Questions, angles_about_baseline
 from groma.mapping.lines.line_map import LineMap, explain
 from groma.mapping.lines.linking.tracks import Tracks
-from groma.mapping.lines.matches import external_matches, segment_matches
+from groma.mapping.lines.matches import given_matches, segment_matches
 from groma.mapping.lines.neighbors import covisible_neighbors
 from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.outcomes import Outcome
@@ -119,15 +119,10 @@ def test_matches_of_a_file(world, mapped):
     names = world.scene.images.names
     images = range(len(names))
     pairs = {(names[i], names[j]): world.matches(i, j) for i in images for j in images if i < j}
-    result = map_lines(
-        world.scene, world.segments, external_matches(world.scene, world.segments, ExternalMatches({}, pairs))
-    )
+    result = map_lines(world.scene, world.segments, given_matches(names, ExternalMatches({}, pairs)))
     owner = true_lines(world, result)
     assert (owner >= 0).all()
     assert len(owner) >= 20
-    wrong = ExternalMatches({}, {(names[0], names[1]): LineMatches(np.array([[0, 10_000]]), np.ones(1))})
-    with pytest.raises(InputError, match=r"Matches of 0\.png and 1\.png"):
-        external_matches(world.scene, world.segments, wrong)
 
 
 @pytest.mark.compiled

@@ -277,7 +277,7 @@ def structure_variables(scene: Scene, options: AssemblyOptions) -> dict[str, Var
     """Return the groups of planes and directions, if they take part."""
     variables = {}
     if options.planes and scene.num_planes:
-        chart = PLANE_CHARTS[options.plane_chart]
+        chart = PLANE_CHARTS["normal_offset"]
         variables["planes"] = Variables(chart, chart.from_ambient(scene.planes.hesse))
     if options.planes and scene.num_directions:
         chart = next(iter(DIRECTION_CHARTS.values()))

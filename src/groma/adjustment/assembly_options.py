@@ -10,7 +10,6 @@ from groma._typing import BoolArray, FloatArray
 from groma.errors import InputError, did_you_mean
 from groma.factors.losses import Loss, Trivial
 from groma.geometry.charts.line_charts import LINE_CHARTS
-from groma.geometry.charts.plane_charts import PLANE_CHARTS
 
 #: How well landmarks keep to what they lie on, as a length in the images, pixels: walls are not flat.
 SURFACE_SIGMA_PX = 0.2
@@ -60,8 +59,6 @@ class AssemblyOptions:
     point_chart: str = "auto"
     #: A name of :data:`groma.geometry.charts.line_charts.LINE_CHARTS`.
     line_chart: str = "cartesian"
-    #: A name of :data:`groma.geometry.charts.plane_charts.PLANE_CHARTS`.
-    plane_chart: str = "normal_offset"
     #: How segments are compared with lines: ``endpoints``, the distances of the ends from the line in the image;
     #: ``bearing``, the angles between the rays of the ends and the plane through camera and line; ``normal``, the
     #: normal of that plane against the line's direction and the ray to its anchor.
@@ -78,8 +75,6 @@ class AssemblyOptions:
     #: How well points and lines keep to their planes and lines, as a length in the images, pixels; for relations
     #: without a standard deviation of their own.
     structure_sigma_px: float = SURFACE_SIGMA_PX
-    #: How parallel or perpendicular planes are, radians; for relations without a standard deviation of their own.
-    plane_angle_sigma: float = math.radians(0.7)
     #: Relations between landmarks as distances (``metric``, weighted by ``structure_sigma_px``) or as differences of
     #: pixels (``pixels``, weighted by the noise of the images). Those with a standard deviation are always distances.
     structure_form: str = "metric"
@@ -110,7 +105,6 @@ class AssemblyOptions:
         for name, known in (
             ("point_chart", ("auto", "euclidean")),
             ("line_chart", LINE_CHARTS),
-            ("plane_chart", PLANE_CHARTS),
             ("line_residual", LINE_RESIDUALS),
             ("plane_residual", PLANE_RESIDUALS),
             ("structure_form", ("metric", "pixels")),

@@ -218,6 +218,3 @@ def _row(
     return ConsistencyRow(
         gauge, kind, dof, len(values), average, low, high, low <= average <= high, least <= average <= most
     )
-
-
-__all__ = ["ConsistencyReport", "ConsistencyRow", "consistency"]

@@ -121,6 +121,3 @@ def _sigma(covariance: FloatArray) -> FloatArray:
 def _total(covariance: FloatArray) -> FloatArray:
     """Roots of the summed variances (N,) of covariances (N, m, m)."""
     return np.sqrt(np.maximum(np.einsum("nii->n", covariance), 0.0))
-
-
-__all__ = ["standard_deviations", "write_covariances"]

@@ -128,7 +128,6 @@ def parallel_lines(
     covariance: FloatArray,
     sigma: float,
     turned: FloatArray | None,
-    candidates: FloatArray,
     wanted: Acceptance,
 ) -> ParallelLines:
     """Find the directions that lines share; ``turned`` None: ends do not deviate. See the module."""
@@ -137,7 +136,6 @@ def parallel_lines(
     noise = [(angle, one) for angle in np.geomspace(PARALLEL.looser * sigma, sigma, PARALLEL.angles) for one in px]
     pools = map_in_threads(lambda one: Parallel.of(directions, covariance, np.hypot(one[0], one[1] * turned)), noise)
     guesses = directions[np.argsort(pools[0].area, kind="stable")[: PARALLEL.max_candidates]]
-    guesses = np.concatenate([guesses, candidates])
     found = _search(pools[0], guesses, wanted)
     best = _most_likely(pools, found) if len(found.vectors) else len(pools) - len(px)
     if best:

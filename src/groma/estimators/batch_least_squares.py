@@ -174,7 +174,7 @@ def _solve_all(
             steps[n] += 1
             done = better = False
             for _ in range(MAX_ATTEMPTS):
-                better = False
+                better, after = False, before
                 if solve_damped(H, g, damping, L, step, parameters):
                     _move(kind, here, frame, step, trial)
                     _frame(kind, trial, trial_frame)

@@ -82,8 +82,6 @@ class DirectionOptions:
     #: Least number of features that agree beyond those that determine a direction, one line or two segments: four
     #: parallel lines are enough, if they are long enough not to be parallel by chance.
     min_coincidences: int = 3
-    #: Least number of groups (images, for segments) among them.
-    min_groups: int = 1
     #: Expected number of directions found where there are none (convention: of tests by meaningfulness).
     max_false_alarms: float = 1e-4
     #: Most directions (cost: time).
@@ -124,8 +122,6 @@ def directions_from_normals(
     normals: FloatArray,
     factors: FloatArray,
     options: DirectionOptions | None = None,
-    groups: IntArray | None = None,
-    candidates: FloatArray | None = None,
 ) -> DirectionSet:
     r"""Find directions perpendicular to many unit normals: vanishing directions of segments.
 
@@ -138,10 +134,6 @@ def directions_from_normals(
         Square roots of the normals' covariances, :math:`F F^\top`, radians.
     options : DirectionOptions, optional
         What counts as a direction.
-    groups : (N,) int, optional
-        Group of each normal, for ``min_groups``: the image.
-    candidates : (H, 3) float64, optional
-        Directions to try; by default cross products of pairs of normals drawn by their information.
 
     Returns
     -------
@@ -161,14 +153,13 @@ def directions_from_normals(
             f"normals and factors must have shapes (N, 3) and (N, 3, 2); got {normals.shape} and {factors.shape}."
         )
     _check_finite(normals, factors)
-    return _search(Perpendicular(normals, factors, options.parallel_sigma), options, groups, candidates)
+    return _search(Perpendicular(normals, factors, options.parallel_sigma), options)
 
 
 def directions_from_lines(
     directions: FloatArray,
     covariance: FloatArray,
     options: DirectionOptions | None = None,
-    candidates: FloatArray | None = None,
     turned: FloatArray | None = None,
 ) -> DirectionSet:
     """Find directions shared by 3D lines; either sign of a line's direction is the same.
@@ -181,8 +172,6 @@ def directions_from_lines(
         Their covariances, square radians; only the part across the direction counts.
     options : DirectionOptions, optional
         What counts as a direction.
-    candidates : (H, 3) float64, optional
-        Further directions to try, such as vanishing directions of images.
     turned : (N,) float64, optional
         Angle by which a pixel at both ends turns each line, radians: how far edges deviate from what they are parallel
         to is estimated. By default they do not.
@@ -206,11 +195,10 @@ def directions_from_lines(
             f"{covariance.shape}."
         )
     _check_finite(directions, covariance)
-    guesses = np.zeros((0, 3)) if candidates is None else unit(vectors(candidates, 3, "candidates"))
     sigma, bound = options.parallel_sigma, options.max_false_alarms
     apart = PARALLEL.same * sigma
     wanted = Acceptance(options.min_coincidences + 1, options.max_directions, options.max_sigma, apart, bound)
-    found = parallel_lines(unit(directions), covariance, sigma, turned, guesses, wanted)
+    found = parallel_lines(unit(directions), covariance, sigma, turned, wanted)
     agrees = (found.probability > 0.5) & (found.squared < PARALLEL.quantile(options.level))
     return DirectionSet(
         found.vectors,
@@ -263,12 +251,7 @@ def _check_finite(*arrays: FloatArray) -> None:
         raise InputError("Directions, normals and covariances must be finite. Remove the rows that are not.")
 
 
-def _search(
-    features: Perpendicular,
-    options: DirectionOptions,
-    groups: IntArray | None,
-    candidates: FloatArray | None,
-) -> DirectionSet:
+def _search(features: Perpendicular, options: DirectionOptions) -> DirectionSet:
     """Find directions one by one; see the module."""
     rng = np.random.default_rng(options.seed)
     gate = chi_square_gate(1.0 - options.level, 1)
@@ -283,9 +266,7 @@ def _search(
     how = DIRECTIONS.wider, DIRECTIONS.max_move, DIRECTIONS.refine_steps
     while len(found) < options.max_directions and len(remaining) >= max(least, 2):
         pool = features.take(remaining)
-        guesses = candidates
-        if guesses is None:
-            guesses = crossings(pool, DIRECTIONS.max_candidates, DIRECTIONS.min_sine, rng)
+        guesses = crossings(pool, DIRECTIONS.max_candidates, DIRECTIONS.min_sine, rng)
         if len(guesses) == 0:
             break
         scored = pool
@@ -299,13 +280,12 @@ def _search(
             count = int(inside.sum())
             expected = float(np.broadcast_to(pool.chance(direction[None], gate), (1, len(pool))).sum())
             tail = log10_poisson_tail(count - 1, expected) + np.log10(tried)
-            spread = count if groups is None else len(np.unique(groups[remaining[inside]]))
             certain = float(np.linalg.eigvalsh(covariance)[-1]) < options.max_sigma**2
             strong = tail < np.log10(options.max_false_alarms) and count >= least
             new = all(
                 abs(float(direction @ other)) < np.cos(DIRECTIONS.same * options.parallel_sigma) for other in found
             )
-            if strong and certain and new and spread >= options.min_groups:
+            if strong and certain and new:
                 accepted = direction, covariance, tail
                 break
         if accepted is None:

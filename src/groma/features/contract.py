@@ -80,6 +80,3 @@ class ImageRetrieval(Protocol):
     def similarity(self, query: Any, others: Sequence[Any]) -> FloatArray:
         """Return how alike a described image is to each of others, (N,) finite numbers, higher is more alike."""
         ...
-
-
-__all__ = ["ImageRetrieval", "ImageView", "SegmentDetector", "SegmentMatcher"]

@@ -155,6 +155,3 @@ def _row_lengths(ambient: FloatArray, kind: str) -> FloatArray:
     distance = np.linalg.norm(ambient[:, far], axis=1, keepdims=True) / np.where(direction > 0.0, direction, np.inf)
     lengths[:, far] = np.maximum(distance, 1.0)
     return lengths
-
-
-__all__ = ["conversion_jacobian", "convert", "convert_covariance"]

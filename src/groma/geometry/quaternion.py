@@ -215,17 +215,3 @@ def from_wxyz(q: FloatArray) -> FloatArray:
 def to_wxyz(q: FloatArray) -> FloatArray:
     """Change the order to [w, x, y, z]."""
     return np.roll(_quaternions(q), 1, axis=-1)
-
-
-__all__ = [
-    "conjugate",
-    "exp",
-    "from_matrix",
-    "from_wxyz",
-    "log",
-    "multiply",
-    "normalize",
-    "rotate",
-    "to_matrix",
-    "to_wxyz",
-]

@@ -245,23 +245,3 @@ def right_jacobian(xi: FloatArray) -> FloatArray:
 def right_jacobian_inverse(xi: FloatArray) -> FloatArray:
     """Inverse of :func:`right_jacobian`, (..., 6, 6); singular at an angle of 2 pi."""
     return left_jacobian_inverse(-_twists(xi))
-
-
-__all__ = [
-    "adjoint",
-    "compose",
-    "exp",
-    "from_matrix",
-    "hat",
-    "identity",
-    "inverse",
-    "left_jacobian",
-    "left_jacobian_inverse",
-    "log",
-    "looking_at",
-    "right_jacobian",
-    "right_jacobian_inverse",
-    "to_matrix",
-    "transform_points",
-    "vee",
-]

@@ -247,20 +247,3 @@ def right_jacobian(omega: FloatArray) -> FloatArray:
 def right_jacobian_inverse(omega: FloatArray) -> FloatArray:
     """Inverse of :func:`right_jacobian`, (..., 3, 3); singular at an angle of 2 pi."""
     return left_jacobian_inverse(-_vectors(omega))
-
-
-__all__ = [
-    "adjoint",
-    "coefficients",
-    "compose",
-    "exp",
-    "hat",
-    "inverse",
-    "left_jacobian",
-    "left_jacobian_inverse",
-    "log",
-    "right_jacobian",
-    "right_jacobian_inverse",
-    "rotate",
-    "vee",
-]

@@ -55,6 +55,3 @@ class Geometry:
         a, b = rng.random((2, count, 1))
         a, b = np.where(a + b > 1, 1 - a, a), np.where(a + b > 1, 1 - b, b)
         return self.triangles[row, 0] + a * first[row] + b * second[row]
-
-
-__all__ = ["Geometry"]

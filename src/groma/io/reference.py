@@ -211,6 +211,3 @@ def _read_ply(place: Path) -> Geometry:
             column = "vertex_indices" if "vertex_indices" in table else "vertex_index"
             elements += [list(map(int, row)) for row in table[column]]
     return _of_elements(vertices, _fans(elements))
-
-
-__all__ = ["ReferenceLines", "holds_scene", "read_line3dpp", "read_reference"]

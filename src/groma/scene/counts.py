@@ -54,6 +54,3 @@ def measurements_of(scene: "Scene") -> dict[str, int]:
         "held objects": len(scene.held),
     }
     return {name: count for name, count in counts.items() if count}
-
-
-__all__ = ["counts_of", "measurements_of", "num_relations", "sentence_of"]

@@ -114,6 +114,3 @@ class PoseGraph:
         key = ends[0, kept] * count + ends[1, kept]
         used[moved] = kept[np.searchsorted(key, before[moved] * count + moved)]
         return before, used
-
-
-__all__ = ["GraphPoses", "Motions", "PoseGraph"]

@@ -19,10 +19,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from groma._typing import BoolArray, FloatArray, IntArray
+from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.factors.contract import Ref
-from groma.factors.losses import Loss, Trivial
 from groma.factors.priors.similarity_between import SimilarityBetween
 from groma.geometry.charts.similarity import SIMILARITY_CHARTS
 from groma.problem.problem import Problem
@@ -70,8 +69,6 @@ class SimilarityGraphResult:
 def adjust_similarity_graph(
     cam_from_world: FloatArray,
     motions: SimilarityMotions,
-    held: BoolArray | None = None,
-    loss: Loss | None = None,
     options: SolverOptions | None = None,
 ) -> SimilarityGraphResult:
     """Adjust cameras, each with a scale, to the similarities measured between them.
@@ -79,13 +76,9 @@ def adjust_similarity_graph(
     Parameters
     ----------
     cam_from_world : (N, 8) float64
-        Similarities at the start; of poses, with a scale of 1.
+        Similarities at the start; of poses, with a scale of 1. The first stays.
     motions : SimilarityMotions
         What was measured.
-    held : (N,) bool, optional
-        Cameras that stay; the first one otherwise. One in each connected part should be held.
-    loss : Loss, optional
-        A robust loss on the whitened error of every motion.
     options : SolverOptions, optional
         How it is solved.
 
@@ -100,18 +93,13 @@ def adjust_similarity_graph(
     named = np.concatenate([motions.first_idx, motions.second_idx])
     if named.min() < 0 or named.max() >= count:
         raise InputError(f"A motion names camera {named.max()} or {named.min()}; the cameras are 0 to {count - 1}.")
-    constant: BoolArray = np.asarray(np.arange(count) == 0 if held is None else held, dtype=bool)
     factor = SimilarityBetween(
         first=Ref("cameras", motions.first_idx),
         second=Ref("cameras", motions.second_idx),
         first_from_second=motions.first_from_second,
         sqrt_information=np.asarray(np.linalg.inv(np.linalg.cholesky(motions.covariance)), np.float64),
-        loss=loss or Trivial(),
     )
-    problem = Problem({"cameras": Variables(SIMILARITY_CHARTS["left"], cam_from_world, constant)}, [factor])
-    solution = solve(problem, options or SolverOptions())
+    cameras = Variables(SIMILARITY_CHARTS["left"], cam_from_world, np.arange(count) == 0)
+    solution = solve(Problem({"cameras": cameras}, [factor]), options or SolverOptions())
     squares = squared_norms(factor, solution.problem.variables)
     return SimilarityGraphResult(solution["cameras"], squares, solution.report)
-
-
-__all__ = ["SimilarityGraphResult", "SimilarityMotions", "adjust_similarity_graph"]

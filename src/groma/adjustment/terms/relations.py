@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import fields
 from typing import Any
@@ -48,6 +49,9 @@ _TYPES: dict[str, type[Factor]] = {
 }
 #: Types of the factors of relations, and the relation of the scene each stands for.
 RELATION_FACTORS = {factor.type_name: kind for kind, factor in _TYPES.items()}
+#: How parallel or perpendicular planes and directions without a standard deviation of their own are, radians
+#: (convention: 0.7 degrees).
+_ANGLE_SIGMA = math.radians(0.7)
 
 
 def lengths_per_pixel(scene: Scene, kind: str) -> FloatArray:
@@ -96,7 +100,7 @@ def _weights(draft: Draft, kind: str, rows: IntArray) -> FloatArray:
     relations, segments = draft.scene.relations, draft.scene.lines.segments
     sigma, landmark = relations.sigma(kind)[rows], getattr(relations, kind)[rows, 0]
     if kind in ANGLES:
-        return 1.0 / np.where(sigma > 0.0, sigma, draft.options.plane_angle_sigma)
+        return 1.0 / np.where(sigma > 0.0, sigma, _ANGLE_SIGMA)
     if (sigma > 0.0).all():
         return 1.0 / sigma
     of = "point" if kind.startswith("point") else "line"

@@ -1,28 +1,34 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""How exact the held poses of a map are: what its points say against them.
+r"""Errors of held poses, estimated from the points of the map.
 
-Poses of a survey, or of another program, have errors :math:`e_i`, left twists with the covariance :math:`\Sigma`:
-:math:`\sigma_t^2` for each coordinate of a centre, :math:`\sigma_r^2` for each of a rotation. Poses and points are
-adjusted with the held poses as measurements of this covariance. With the normal equations of the poses there, points
-eliminated, :math:`H` and :math:`g_0`, and the twist :math:`\delta` back to the held poses, the gradients at these are
+Poses of a survey or of another program are held, and have errors :math:`e_i`: left twists with the covariance
+:math:`\Sigma`, whose variances :math:`\sigma_t^2` (a coordinate of a centre) and :math:`\sigma_r^2` (of a rotation)
+are unknown. They are estimated in three steps.
 
-.. math:: g = g_0 + H \delta = H e + n , \qquad \operatorname{cov} n = H .
+1. *Adjustment.* Poses and points are adjusted; the held poses are measurements of covariance :math:`\Sigma`, by the
+   estimate so far. Linearised at the held poses, robust weights would take errors of poses for outliers, and the
+   gradient would be too small.
+2. *Gradient at the held poses.* Let :math:`H` and :math:`g_0` be the normal equations of the poses after the
+   adjustment, points eliminated, and :math:`\delta` the twists from there to the held poses. Then
 
-(Those of the residuals at the held poses are smaller: robust weights mistake errors of poses for outliers.) The
-variances are those of restricted maximum likelihood: with
+   .. math:: g = g_0 + H \delta = H e + n , \qquad \operatorname{cov} n = H .
 
-.. math:: W = (I + H \Sigma)^{-1} H, \qquad u = (I + H \Sigma)^{-1} g ,
+3. *Variances*, by restricted maximum likelihood. With
 
-and their blocks of centres and of rotations, the fixed point of
+   .. math:: W = (I + H \Sigma)^{-1} H, \qquad u = (I + H \Sigma)^{-1} g ,
 
-.. math:: \sum_l \|W_{kl}\|_F^2\, \sigma_l^2 =
-          |u_k|^2 - \operatorname{tr} W_{kk} + \sum_l \|W_{kl}\|_F^2\, \sigma_l^2 , \qquad k, l \in \{t, r\} ,
+   and their blocks of centres (t) and rotations (r), new variances on the left follow from old ones on the right:
 
-where those on the right are of the step before, and none is negative; exact poses have none. Motions of the whole map,
-of which points know nothing, have no part in it: :math:`H` is zero for them.
+   .. math:: \sum_l \|W_{kl}\|_F^2\, \sigma_l^2 =
+             |u_k|^2 - \operatorname{tr} W_{kk} + \sum_l \|W_{kl}\|_F^2\, \sigma_l^2 , \qquad k, l \in \{t, r\} ,
 
-The pose of one image that its points ask for, all others held, then differs from the held one by
-:math:`e_i + H_{ii}^{-1} \sum_{j \ne i} H_{ij} e_j`, whose covariance is known, too.
+   solved without negative ones, until they no longer change. Variances of exact poses become zero.
+
+Points say nothing of motions of the whole map: :math:`H` is zero for them, and they do not change the estimate.
+
+A map with such poses misplaces photographs, too. With all others held, the points of image i ask for a pose that
+differs from the held one by :math:`e_i + H_{ii}^{-1} \sum_{j \ne i} H_{ij} e_j`; the covariance follows from
+:math:`\Sigma`.
 
 Reference: H. D. Patterson, R. Thompson, *Recovery of inter-block information when block sizes are unequal*, 1971.
 """

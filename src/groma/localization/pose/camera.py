@@ -86,6 +86,3 @@ class QueryCamera:
     def of(table: Cameras, row: int) -> QueryCamera:
         """One camera of a scene."""
         return QueryCamera(table.models[row], table.params_of(row), int(table.width[row]), int(table.height[row]))
-
-
-__all__ = ["QueryCamera"]

@@ -88,27 +88,9 @@ def segment_matches(
         The matcher, or its name in :data:`groma.features.registry.MATCHERS`: ``wide_baseline`` matches by surroundings,
         shared points and the epipolar geometry of the scene's poses, ``flow`` by dense optical flow, for sequences.
     """
-    _one_per_image(scene, segments)
+    if len(segments) != scene.num_images:
+        raise InputError(f"segments must hold one set per image ({scene.num_images}); got {len(segments)}.")
     return _Matched(scene, segments, image, MATCHERS.make(matcher))
-
-
-def external_matches(scene: Scene, segments: Sequence[Segments], matches: ExternalMatches) -> MatchProvider:
-    """Matches of a file, by the names of the images.
-
-    Raises
-    ------
-    InputError
-        If matches refer to segments that do not exist: they were made from other segments than those mapped.
-    """
-    _one_per_image(scene, segments)
-    index = {name: i for i, name in enumerate(scene.images.names)}
-    for (first, second), found in matches.matches.items():
-        if first in index and second in index:
-            try:
-                found.check(len(segments[index[first]]), len(segments[index[second]]))
-            except InputError as error:
-                raise InputError(f"Matches of {first} and {second}: {error}") from error
-    return given_matches(scene.images.names, matches)
 
 
 def given_matches(names: Sequence[str], matches: ExternalMatches) -> MatchProvider:
@@ -118,8 +100,3 @@ def given_matches(names: Sequence[str], matches: ExternalMatches) -> MatchProvid
 
 def _match_of(names: Sequence[str], matches: ExternalMatches, i: int, j: int) -> LineMatches:
     return matches.match(names[i], names[j])
-
-
-def _one_per_image(scene: Scene, segments: Sequence[Segments]) -> None:
-    if len(segments) != scene.num_images:
-        raise InputError(f"segments must hold one set per image ({scene.num_images}); got {len(segments)}.")

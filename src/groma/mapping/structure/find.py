@@ -99,7 +99,6 @@ class Structure:
 def find_structure(
     scene: Scene,
     options: StructureOptions | None = None,
-    candidates: FloatArray | None = None,
     progress: Callable[[str, int, int], None] | None = None,
     noise: LandmarkNoise | None = None,
 ) -> Scene:
@@ -112,8 +111,6 @@ def find_structure(
         relations that it has are replaced.
     options : StructureOptions, optional
         See there.
-    candidates : (H, 3) float64, optional
-        Directions in the world to try for lines, such as vanishing points of images, turned to the world.
     progress : callable, optional
         Called with stage, number done, number in all.
     noise : optional
@@ -133,13 +130,12 @@ def find_structure(
     -----
     Poses are held. Adjust the scene first: in a distorted reconstruction walls are not planar.
     """
-    return detect_structure(scene, options, candidates, progress, noise).scene
+    return detect_structure(scene, options, progress, noise).scene
 
 
 def detect_structure(
     scene: Scene,
     options: StructureOptions | None = None,
-    candidates: FloatArray | None = None,
     progress: Callable[[str, int, int], None] | None = None,
     noise: LandmarkNoise | None = None,
 ) -> Structure:
@@ -154,7 +150,7 @@ def detect_structure(
     level, least, least_line = options.level, options.min_probability, options.min_line_probability
     report("finding planes", 0, 1)
     marks = _landmarks(scene, options, noise)
-    parallels = begin(partial(_parallels, scene, marks, options, candidates))
+    parallels = begin(partial(_parallels, scene, marks, options))
     meeting = begin(partial(meetings, marks, level, least_line))
     on_line = on_lines(marks, level, least)
     planes = _planes_in(marks, on_line, options, partial(report, "finding planes"))
@@ -213,16 +209,13 @@ def _planes_in(
     )
 
 
-def _parallels(
-    scene: Scene, marks: Landmarks, options: StructureOptions, candidates: FloatArray | None
-) -> tuple[DirectionSet, Pairs]:
+def _parallels(scene: Scene, marks: Landmarks, options: StructureOptions) -> tuple[DirectionSet, Pairs]:
     """Directions that usable lines share, and the lines along them."""
     lines, length = np.flatnonzero(marks.line_usable), norm(marks.segments[:, 1] - marks.segments[:, 0])
     found = directions_from_lines(
         scene.lines.plucker[lines, 3:],
         marks.own_line_noise.directions(length)[lines],
         replace(options.directions, level=options.level),
-        candidates,
         math.sqrt(2.0) * marks.line_pixel[lines] / length[lines],
     )
     rows = np.flatnonzero(found.label >= 0)

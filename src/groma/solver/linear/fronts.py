@@ -33,6 +33,7 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.problem.layout import Layout
 from groma.solver.linear.blocks import Blocks
+from groma.solver.linear.contract import PIVOT_TOLERANCE
 from groma.solver.linear.lapack import potrf, potri, solve_lower
 from groma.solver.linear.leaf_fronts import Leaves
 from groma.solver.linear.ordering import fill_reducing_order
@@ -184,13 +185,14 @@ class Fronts:
                 c = columns[:, None, None] + np.arange(own.shape[2])
                 F[r, c] = own
                 F[c, r] = own
+            n = front.size
+            smallest = PIVOT_TOLERANCE * F.diagonal()[:n]
             if len(front.leaves) and not self._leaves.eliminate(front.leaves, values, F):
                 return False
             for index, U in updates.pop(f, []):
                 F[np.ix_(index, index)] += U
-            n = front.size
             L, info = potrf(F[:n, :n], lower=1, clean=1)
-            if info != 0 or not np.isfinite(L).all():
+            if info != 0 or not np.isfinite(L).all() or (L.diagonal() ** 2 <= smallest).any():
                 return False
             below = solve_lower(L, F[:n, n:]).T
             if front.parent >= 0:

@@ -17,6 +17,7 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray, IntArray
+from groma.solver.linear.contract import PIVOT_TOLERANCE
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
 
@@ -31,7 +32,7 @@ def _cholesky(panel, n):
                 total -= panel[r, k] * panel[c, k]
             if r > c:
                 panel[r, c] = total / panel[c, c]
-            elif total > 0.0 and total < np.inf:
+            elif total > PIVOT_TOLERANCE * panel[r, r] and total < np.inf:
                 panel[r, r] = np.sqrt(total)
             else:
                 return False

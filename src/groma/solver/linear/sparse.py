@@ -1,32 +1,30 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The reduced system solved by a sparse factorisation with a fill-reducing symmetric ordering.
 
-Block by block where all have one size (:mod:`groma.solver.linear.block_cholesky`), else by numbers (SuperLU).
+Block by block where all have one size (:mod:`groma.solver.linear.block_cholesky`), else front by front
+(:mod:`groma.solver.linear.fronts`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from groma._typing import FloatArray, IntArray
+from groma._typing import FloatArray
 from groma.problem.layout import Layout
 from groma.solver.linear.block_cholesky import BlockCholesky
 from groma.solver.linear.blocks import Blocks, split
-from groma.solver.linear.contract import PIVOT_TOLERANCE, LinearSolver, is_pose_graph, register_linear_solver
+from groma.solver.linear.contract import LinearSolver, is_pose_graph, register_linear_solver
 from groma.solver.linear.dense import DENSE_FLOPS_PER_SECOND
-
-if TYPE_CHECKING:
-    from scipy.sparse import csc_matrix
+from groma.solver.linear.fronts import Fronts
 
 
 @register_linear_solver("sparse")
 def sparse(layout: Layout) -> LinearSolver:
     """Return the sparse solver that suits a layout."""
-    return SparseBlocks(layout) if len(layout.kept) == 1 else SparseMatrix(layout)
+    return SparseBlocks(layout) if len(layout.kept) == 1 else SparseFronts(layout)
 
 
 class SparseBlocks:
@@ -59,8 +57,8 @@ class SparseBlocks:
         return [x] if np.isfinite(x).all() else None
 
 
-class SparseMatrix:
-    """Factorisation of the scalar sparse matrix."""
+class SparseFronts:
+    """Factorisation front by front, where blocks have several sizes."""
 
     name = "sparse"
     num_iterations = 0
@@ -69,50 +67,18 @@ class SparseMatrix:
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
 
+    @cached_property
+    def _fronts(self) -> Fronts:
+        return Fronts(self._layout)
+
     def expected_seconds(self) -> float:  # noqa: D102
         return np.inf
 
     def follow(self, states: Mapping[str, FloatArray]) -> None:  # noqa: D102
         pass
 
-    @cached_property
-    def _pattern(self) -> tuple[csc_matrix, IntArray]:
-        """The matrix, and which number of the blocks each of its entries is."""
-        from scipy.sparse import csc_matrix  # takes a quarter of a second to import
-
-        layout = self._layout
-        n = layout.num_kept_unknowns
-        rows_of, columns_of, source = [], [], []
-        position = 0
-        for a, b in layout.blocks:
-            rows, columns = layout.blocks[a, b]
-            wa, wb = layout.kept[a].width, layout.kept[b].width
-            r = layout.kept[a].start + rows[:, None, None] * wa + np.arange(wa)[None, :, None]
-            c = layout.kept[b].start + columns[:, None, None] * wb + np.arange(wb)[None, None, :]
-            r, c = (np.broadcast_to(x, (len(rows), wa, wb)).reshape(-1) for x in (r, c))
-            s = position + np.arange(len(r))
-            position += len(r)
-            upper = r <= c
-            r, c, s = r[upper], c[upper], s[upper]
-            off = r != c
-            rows_of += [r, c[off]]
-            columns_of += [c, r[off]]
-            source += [s, s[off]]
-        r, c, s = np.concatenate(rows_of), np.concatenate(columns_of), np.concatenate(source)
-        matrix = csc_matrix((s + 1.0, (r, c)), shape=(n, n))
-        matrix.sort_indices()
-        return matrix, (matrix.data - 1).astype(np.int64)
-
     def solve(self, blocks: Blocks, rhs: list[FloatArray]) -> list[FloatArray] | None:  # noqa: D102
-        from scipy.sparse.linalg import splu
-
-        matrix, source = self._pattern
-        matrix.data = np.concatenate([blocks[pair].reshape(-1) for pair in self._layout.blocks])[source]
-        try:
-            factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        except RuntimeError:  # exactly singular
+        if not self._fronts.factorize(blocks):
             return None
-        if (factor.U.diagonal() <= PIVOT_TOLERANCE * matrix.diagonal()[np.argsort(factor.perm_c)]).any():
-            return None
-        x = factor.solve(np.concatenate(rhs))
+        x = self._fronts.solve(np.concatenate(rhs)[:, None])[:, 0]
         return split(self._layout, x) if np.isfinite(x).all() else None

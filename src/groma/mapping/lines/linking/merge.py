@@ -48,6 +48,8 @@ class MergeGates:
     max_angle: float = gate(0.2, "rad", "between lines that are compared", "chosen on fountain, herz")
 
 
+#: The defaults.
+MERGE = MergeGates()
 #: Median of the mean of four squared normal numbers, half of them independent.
 _MEDIAN_SQUARE = 0.6
 
@@ -157,24 +159,24 @@ def _apart(pairs, pointers, rows, image, ends, line, min_overlap, same_edge, apa
 
 
 # ------------------------------------------------------------------------------------------------------------- Public
-def merge_agreeing(tracks: Tracks, gates: MergeGates = MergeGates()) -> Tracks:
+def merge_agreeing(tracks: Tracks) -> Tracks:
     """Return the tracks with lines joined that agree within their uncertainty and that of the poses.
 
     The segments of joined lines get the deviation of the poses added to their own, so that the fit keeps them.
     """
     pose_px = None
     while True:  # every round leaves fewer lines
-        pairs = _compare(tracks, gates)
+        pairs = _compare(tracks)
         pairs = pairs.take(~seen_apart(tracks, pairs.lines))
         if len(pairs.lines) == 0:
             break
         if pose_px is None:
-            pose_px = _pose_deviation(pairs, tracks.num_lines, gates)
+            pose_px = _pose_deviation(pairs, tracks.num_lines)
         distance = pairs.squared_distance(pose_px)
         good = _preferred(pairs.lines, distance, tracks.num_lines) & (distance < AGREEMENT.max_squared(4))
         if not good.any():
             break
-        tracks = _joined(tracks, pairs.take(good), pose_px, gates)
+        tracks = _joined(tracks, pairs.take(good), pose_px)
     return tracks.keep(tracks.num_images() >= 2, Outcome.FEW_IMAGES)
 
 
@@ -201,7 +203,7 @@ class _Pairs:
         return np.einsum("mi,mi->m", self.offset, np.linalg.solve(total, self.offset[..., None])[..., 0])
 
 
-def _compare(tracks: Tracks, gates: MergeGates) -> _Pairs:
+def _compare(tracks: Tracks) -> _Pairs:
     """Pairs of lines that are near each other."""
     views, count, X = tracks.views, tracks.num_lines, tracks.lines
     unit = begin(partial(_pixel_size, tracks))
@@ -215,7 +217,7 @@ def _compare(tracks: Tracks, gates: MergeGates) -> _Pairs:
 
     map_ranges(inform, count, PROBLEMS_AT_ONCE)
     noise = begin(lambda: np.linalg.inv(H + 1e-9 * np.einsum("nii->n", H)[:, None, None] * np.eye(4)))
-    pairs, span = _candidates(X, gates.max_distance * unit(), gates)
+    pairs, span = _candidates(X, MERGE.max_distance * unit())
     (a, b), covariance = pairs.T, noise()
     along = X[b, 1] - X[b, 0]
     places = X[a, None, 0] + span[:, :, None] * (X[a, 1] - X[a, 0])[:, None]
@@ -231,7 +233,7 @@ def _compare(tracks: Tracks, gates: MergeGates) -> _Pairs:
     return _Pairs(pairs, offset, spread, np.minimum(unit()[a], unit()[b]))
 
 
-def _candidates(X: FloatArray, reach: FloatArray, gates: MergeGates = MergeGates()) -> tuple[IntArray, FloatArray]:
+def _candidates(X: FloatArray, reach: FloatArray) -> tuple[IntArray, FloatArray]:
     """Pairs (M, 2) of near, nearly parallel lines and their overlap (M, 2): a sweep along one axis in bins of another.
 
     Work grows with the number of lines where their density stays the same.
@@ -254,7 +256,7 @@ def _candidates(X: FloatArray, reach: FloatArray, gates: MergeGates = MergeGates
     pairs, span = np.empty((4096, 2), np.int64), np.empty((4096, 2))
     while True:
         needed = _near_pairs(
-            pointers, members, first_bin, low, X, reach, gates.max_angle, AGREEMENT.min_overlap, pairs, span
+            pointers, members, first_bin, low, X, reach, MERGE.max_angle, AGREEMENT.min_overlap, pairs, span
         )
         if needed <= len(pairs):
             break
@@ -298,17 +300,17 @@ def _preferred(pairs: IntArray, distance: FloatArray, count: int) -> BoolArray:
     return (distance <= best[pairs[:, 0]]) & (distance <= best[pairs[:, 1]])
 
 
-def _pose_deviation(pairs: _Pairs, count: int, gates: MergeGates) -> float:
+def _pose_deviation(pairs: _Pairs, count: int) -> float:
     """Deviation of the poses in pixels: what pairs that prefer each other disagree by beyond their own noise."""
-    floor = gates.pose_px[0]
+    floor = MERGE.pose_px[0]
     good = pairs.take(_preferred(pairs.lines, pairs.squared_distance(floor), count))
     excess = (good.offset**2).mean(1) - np.einsum("mii->m", good.covariance) / 4.0
-    if len(excess) < gates.min_pairs:
+    if len(excess) < MERGE.min_pairs:
         return floor
-    return float(np.clip(np.sqrt(max(np.median(excess / good.unit**2), 0.0) / _MEDIAN_SQUARE), *gates.pose_px))
+    return float(np.clip(np.sqrt(max(np.median(excess / good.unit**2), 0.0) / _MEDIAN_SQUARE), *MERGE.pose_px))
 
 
-def _joined(tracks: Tracks, pairs: _Pairs, pose_px: float, gates: MergeGates) -> Tracks:
+def _joined(tracks: Tracks, pairs: _Pairs, pose_px: float) -> Tracks:
     """Join disjoint pairs, the line seen in fewer images to the other, and fit them anew."""
     excess = np.sqrt((pairs.offset**2).mean(1)) / pairs.unit
     images, lines = tracks.num_images(), pairs.lines
@@ -316,5 +318,5 @@ def _joined(tracks: Tracks, pairs: _Pairs, pose_px: float, gates: MergeGates) ->
     lines = np.where(turned[:, None], lines[:, ::-1], lines)
     alias, deviation = np.arange(tracks.num_lines), np.zeros(tracks.num_lines)
     alias[lines[:, 1]] = lines[:, 0]
-    deviation[lines] = np.where(excess > gates.pose_px[0], pose_px, 0.0)[:, None]
+    deviation[lines] = np.where(excess > MERGE.pose_px[0], pose_px, 0.0)[:, None]
     return tracks.joined(alias, deviation)
