@@ -24,7 +24,8 @@ FLOOR = 3.0
 #: Straight pieces of a rim.
 RIM = 64
 BACKGROUND = 30.0
-#: Which of the six sides of a box is its bottom.
+#: Corners of the six sides of a box, with x, y, z from low to high, the last the fastest; which side is its bottom.
+BOX_SIDES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
 BOTTOM = 4
 #: Rays per pixel, in either direction.
 SAMPLES = 3
@@ -84,7 +85,9 @@ class _Round:
 
 
 @dataclass(eq=False)
-class _World:
+class World:
+    """Faces, edges and round bodies."""
+
     polygons: list[np.ndarray]
     shades: list[float]
     edges: np.ndarray
@@ -100,7 +103,11 @@ def render_boxes(settings: BoxSettings) -> RenderedScene:
     if settings.num_panels:
         _add_facade(world, settings, rng)
     places = {"random": _scattered, "ring": _ring, "front": _front}[settings.cameras]
-    poses = places(settings, rng)
+    return render(world, places(settings, rng), settings, rng)
+
+
+def render(world: World, poses: np.ndarray, settings: BoxSettings, rng: np.random.Generator) -> RenderedScene:
+    """Make the images of a world from some poses (C, 7), its points and its visible edges."""
     camera = np.array([settings.focal, settings.focal, settings.width / 2, settings.height / 2])
     blotches = [_blotches(rng, settings.blotches) for _ in world.polygons] if settings.texture else None
     images = [_picture(world, pose, camera, settings, blotches, rng) for pose in poses]
@@ -118,13 +125,11 @@ def render_boxes(settings: BoxSettings) -> RenderedScene:
 
 
 # -------------------------------------------------------------------------------------------------------------- world
-def _boxes(settings: BoxSettings, rng: np.random.Generator) -> _World:
+def _boxes(settings: BoxSettings, rng: np.random.Generator) -> World:
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
-    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     pairs = [(a, b) for a in range(8) for b in range(a) if (corners[a] != corners[b]).sum() == 1]
     floor = FLOOR * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-    polygons, shades = [floor], [120.0]
-    edges = [floor[[k, (k + 1) % 4]] for k in range(4)]
+    polygons, shades, edges = [floor], [120.0], [floor[[k, (k + 1) % 4]] for k in range(4)]
     placed: list[tuple[np.ndarray, float]] = []
     while len(placed) < settings.num_boxes:
         half = rng.uniform(0.12, 0.4, 3)
@@ -135,7 +140,7 @@ def _boxes(settings: BoxSettings, rng: np.random.Generator) -> _World:
         a = rng.uniform(0.0, np.pi)
         turn = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
         box = center + (corners * half) @ turn.T
-        polygons += [box[list(side)] for side in sides]
+        polygons += [box[list(side)] for side in BOX_SIDES]
         shades += rng.permutation([50.0, 80, 150, 180, 210, 240]).tolist()
         edges += [box[list(pair)] for pair in pairs]
     rounds: list[_Round] = []
@@ -157,10 +162,10 @@ def _boxes(settings: BoxSettings, rng: np.random.Generator) -> _World:
         edges += _rims(body)
     # Boxes stand on the floor: their first side, at the bottom, is in its plane.
     planes = [0, *(0 if k % 6 == BOTTOM else k + 1 for k in range(len(polygons) - 1))]
-    return _World(polygons, shades, np.array(edges), rounds, planes)
+    return World(polygons, shades, np.array(edges), rounds, planes)
 
 
-def _add_facade(world: _World, settings: BoxSettings, rng: np.random.Generator) -> None:
+def _add_facade(world: World, settings: BoxSettings, rng: np.random.Generator) -> None:
     """A wall at the end of the floor with rectangles: joints, panels, boards; some askew."""
     wall, first = len(world.polygons), len(world.polygons)
     world.polygons.append(FLOOR * np.array([[-1.0, 1, 0], [1, 1, 0], [1, 1, 1], [-1, 1, 1]]))
@@ -356,7 +361,7 @@ def _seen(world, places, pose, camera, settings) -> tuple[np.ndarray, np.ndarray
     return pixel, seen
 
 
-def _visible(world: _World, poses: np.ndarray, camera: np.ndarray, settings: BoxSettings) -> np.ndarray:
+def _visible(world: World, poses: np.ndarray, camera: np.ndarray, settings: BoxSettings) -> np.ndarray:
     """Pieces of the edges that at least two images see."""
     number = PLACES if not world.rounds else PLACES // 5
     share = (np.arange(number) + 0.5) / number
@@ -391,5 +396,5 @@ def _points(world, poses, camera, settings, rng) -> tuple[Points, PointObservati
         rows = np.flatnonzero(seen)
         table.append((np.full(len(rows), i), rows, pixel[rows] + rng.normal(0, 0.3, (len(rows), 2))))
     image, point, pixel = (np.concatenate(column) for column in zip(*table, strict=True))
-    faces = [np.full(len(rows), k if k < len(world.polygons) else -1) for k, rows in enumerate(groups)]
-    return Points.at(xyz), PointObservations(image, point, pixel, np.arange(len(image))), np.concatenate(faces)
+    faces = np.concatenate([np.full(len(rows), k if k < len(world.polygons) else -1) for k, rows in enumerate(groups)])
+    return Points.at(xyz), PointObservations(image, point, pixel, np.arange(len(image))), faces

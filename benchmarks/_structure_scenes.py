@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Rendered boxes and facades on which the search for structure was chosen, and those that it is reported on."""
 
+from _buildings import BuildingSettings
 from _rendered_boxes import BoxSettings
 
 _SMALL = {"width": 640, "height": 480, "focal": 560.0, "num_images": 16}
@@ -55,5 +56,21 @@ LATER = _alike(1100)
 LAST = _alike(1200)
 #: Run once after the least probability of a line along a direction or on a plane had become 0.85.
 UNSEEN = _alike(1400)
+
+
+def _buildings(seed: int) -> dict[str, BuildingSettings]:
+    """One of each kind."""
+    return {f"{kind} {seed}": BuildingSettings(kind, seed) for kind in ("room", "wings", "gable", "stairs")}
+
+
 #: Groups of scenes by the names that the command line takes.
-SCENES = {"chosen": CHOSEN_ON, "reported": REPORTED_ON, "fresh": FRESH, "later": LATER, "last": LAST, "unseen": UNSEEN}
+SCENES = {
+    "chosen": CHOSEN_ON,
+    "reported": REPORTED_ON,
+    "fresh": FRESH,
+    "later": LATER,
+    "last": LAST,
+    "unseen": UNSEEN,
+    "buildings": _buildings(1),
+    "other buildings": _buildings(2),
+}

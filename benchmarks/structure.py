@@ -8,7 +8,8 @@
 The faces of these scenes are known, and so are their edges: which lie in one plane, which are parallel, which meet. A
 mapped line stands for the edge that it lies on; lines that are no edges of the object are left out. Recall is over all
 true pairs of usable lines and points with what enough of them share: a plane of ten points or segment ends, a direction
-of four lines. Maps are kept in the cache, without their structure.
+of four lines. Faces that lie in one plane share it, wherever they are. Maps are kept in the cache,
+without their structure.
 
 With --exact: lines along directions as found, the same where an edge that is turned by less than half a degree counts
 as along, and where the true directions are given exactly, those of four lines or more, or of two, so that only what
@@ -23,11 +24,12 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import product
 from pathlib import Path
 
 import numpy as np
+from _buildings import BuildingSettings, render_building
 from _rendered_boxes import BoxSettings, RenderedScene, render_boxes
 from _structure_scenes import SCENES
 from _workshop import CACHE
@@ -92,9 +94,10 @@ class Truth:
     meeting: np.ndarray
 
 
-def mapped(name: str, settings: BoxSettings, cache: Path) -> tuple[RenderedScene, Scene]:
+def mapped(name: str, settings: BoxSettings | BuildingSettings, cache: Path) -> tuple[RenderedScene, Scene]:
     """Return a rendered scene and the map of its points and lines, without structure."""
-    rendered, file = render_boxes(settings), cache / f"{name.replace(' ', '-').replace(',', '')}.npz"
+    rendered = render_boxes(settings) if isinstance(settings, BoxSettings) else render_building(settings)
+    file = cache / f"{name.replace(' ', '-').replace(',', '')}.npz"
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
         options = MapOptions(refine_poses=False, threads=1)
@@ -109,6 +112,7 @@ def mapped(name: str, settings: BoxSettings, cache: Path) -> tuple[RenderedScene
 
 def truth_of(rendered: RenderedScene, scene: Scene) -> Truth:
     """Find the edge of each line, and what edges and points have in common."""
+    rendered = replace(rendered, plane_of_face=_planes_of_faces(rendered))
     faces = np.unique(rendered.plane_of_face)
     corners = [rendered.faces[k] for k in faces]
     normals = np.array([np.cross(c[1] - c[0], c[-1] - c[0]) for c in corners])
@@ -130,6 +134,15 @@ def truth_of(rendered: RenderedScene, scene: Scene) -> Truth:
     point &= (np.bincount(scene.point_observations.point_idx, minlength=scene.num_points) >= 3)[:, None]
     enough = point.sum(axis=0) + 2 * inside.sum(axis=0) >= 10
     return Truth(own, inside & enough, point & enough, direction, normals, _meeting(scene, own))
+
+
+def _planes_of_faces(rendered: RenderedScene) -> np.ndarray:
+    """(F,) number of the plane of each face; faces in one plane, as the tops of boxes of one height, have the same."""
+    corners = np.array([face[[0, 1, -1]] for face in rendered.faces])
+    hesse = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    hesse /= np.linalg.norm(hesse, axis=1, keepdims=True)
+    away = np.abs(np.einsum("ki,fci->kfc", hesse, corners) - np.einsum("ki,ki->k", hesse, corners[:, 0])[:, None, None])
+    return (away.max(axis=2) < EXACT)[:, rendered.plane_of_face].argmax(axis=0)
 
 
 def _edges_of_faces(rendered: RenderedScene) -> tuple[np.ndarray, np.ndarray]:
@@ -271,7 +284,7 @@ def held(rendered: RenderedScene, scene: Scene) -> dict[str, tuple[float, ...]]:
 def along_exact(truth: Truth, scene: Scene, fewest: int) -> Scene:
     """Lines along the true directions of enough lines: the mixture of the search, and its noise, by likelihood."""
     options, gates = StructureOptions(), ParallelGates()
-    marks = _landmarks(scene, options)
+    marks = _landmarks(scene, options, None)
     lines, length = np.flatnonzero(marks.line_usable), norm(marks.segments[:, 1] - marks.segments[:, 0])
     group, number = np.unique(truth.direction[lines], return_counts=True)
     vectors = unit((truth.edges[:, 1] - truth.edges[:, 0])[group[(group >= 0) & (number >= fewest)]])
@@ -336,7 +349,7 @@ def main() -> None:
     print("| all | " + " | ".join(_cell(total[kind]) for kind in kinds) + " |")
 
 
-def _print_held(scenes: dict[str, BoxSettings], cache: Path) -> None:
+def _print_held(scenes: dict[str, BoxSettings | BuildingSettings], cache: Path) -> None:
     print("Root mean square of centres, of ends of edges from their lines, thousandths, and of normals, mrad\n")
     for number, (name, settings) in enumerate(scenes.items()):
         off = held(*mapped(name, settings, cache))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from groma.estimators.association import log10_poisson_tail
+from groma.estimators.association import log10_binomial_tail, log10_poisson_tail
 from groma.gates import chi_square_gate
 
 
@@ -37,3 +37,15 @@ def test_what_takes_long_to_import_is_not_imported(module):
     code = f"import sys, {module}; print(*[name for name in {heavy!r} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
+
+
+def test_tails_of_binomials():
+    for count in (-1, 0, 5, 19):
+        expected = stats.binom.logsf(count, 20, 0.3) / np.log(10.0)
+        assert log10_binomial_tail(count, 20, 0.3) == pytest.approx(expected, rel=1e-10)
+    assert log10_binomial_tail(3, 4, 1.0) == 0.0
+    # Far below the smallest number.
+    assert log10_binomial_tail(499, 500, 1e-3) == pytest.approx(-1500.0, rel=1e-12)
+    assert log10_binomial_tail(450, 500, 1e-2) == pytest.approx(
+        stats.binom.logpmf(451, 500, 1e-2) / np.log(10), rel=1e-5
+    )

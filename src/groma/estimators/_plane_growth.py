@@ -7,7 +7,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import scipy  # its parts are imported when something of them is first used
 
 from groma._numba import loop
 from groma._ordering import copy, median
@@ -27,7 +26,7 @@ from groma.estimators._plane_loops import (
 )
 from groma.estimators._plane_options import PLANE_SEARCH as GATES
 from groma.estimators._plane_options import PlaneOptions
-from groma.estimators.association import MAX_SQUARE, ROUNDS, log10_poisson_tail
+from groma.estimators.association import MAX_SQUARE, ROUNDS, log10_binomial_tail
 from groma.estimators.plane_fit import PlaneFit, fit_with_covariance
 from groma.geometry.algebra import norm, perpendicular
 
@@ -228,11 +227,11 @@ class Grower:
         return Grown(fit, share, band, alarm, features.places[rows], taken), plane, rows
 
     def _log10_false_alarms(self, plane: FloatArray, rows: IntArray) -> float:
-        """Number of planes tried on which as much would lie by chance, of their neighbourhood, base-10 logarithm."""
+        """Number of planes tried on which as much would lie by chance, of what is in a ball around it, log10."""
         features, places = self._features, self._features.places
         center = places[rows].mean(axis=0)
         radius = float(np.quantile(norm(places[rows] - center), GATES.extent))
-        inside, chance = ball_loop(
+        inside, number, chance = ball_loop(
             places,
             features.packed,
             features.carrier,
@@ -244,9 +243,7 @@ class Grower:
             self._gate,
             self._mark,
         )
-        if inside == 0:
-            return self._log_tried
-        return log10_poisson_tail(inside - 4, chance) + self._log_tried  # three fix it
+        return log10_binomial_tail(inside - 4, number - 3, chance / max(number, 1)) + self._log_tried  # three fix it
 
     def _log10_even(self, inner: int, band: float) -> float:
         """How likely so much of the last layer lies on the plane if it is filled as its fuller side is, log10.
@@ -260,8 +257,7 @@ class Grower:
         on = ~(above | below)
         counted = reach[on | fuller]
         chance = float(np.minimum(2.0 * counted / (counted + band), 1.0).mean())
-        tail = scipy.special.bdtrc(np.count_nonzero(on) - 4, len(counted) - 3, chance)  # three fix it
-        return float(np.log10(max(tail, 1e-300)))
+        return log10_binomial_tail(int(np.count_nonzero(on)) - 4, len(counted) - 3, chance)  # three fix it
 
 
 def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, plane: FloatArray) -> BoolArray:

@@ -347,14 +347,15 @@ def connected_part_loop(places, spacing, partner, carrier, neighbours, rows, hel
 
 @loop
 def ball_loop(places, packed, carrier, balls, rows, center, radius, plane, gate, mark):
-    """Support in a ball, and how much would be in the layer by chance; carried points do not count."""
+    """Support in a ball, all that is there, and how much of it is in the layer by chance; no carried points."""
     squared = radius * radius
     for k in range(len(rows)):
         i = rows[k]
         x, y, z = places[i, 0] - center[0], places[i, 1] - center[1], places[i, 2] - center[2]
         if x * x + y * y + z * z < squared:
             mark[i] = 0
-    inside, chance = 0, 0.0
+    inside = number = 0
+    chance = 0.0
     for b in range(len(balls)):
         x, y, z = balls[b, 0] - center[0], balls[b, 1] - center[1], balls[b, 2] - center[2]
         if x * x + y * y + z * z > (radius + balls[b, 3]) ** 2:
@@ -368,8 +369,9 @@ def ball_loop(places, packed, carrier, balls, rows, center, radius, plane, gate,
             if not x * x + y * y + z * z < squared:
                 continue
             inside += support
+            number += 1
             spread = math.sqrt(max(variance_kernel(packed[i], plane[0], plane[1], plane[2]), 1e-300))
             chance += min(math.sqrt(gate) * spread / max(radius, 1e-300), 1.0)
     for k in range(len(rows)):
         mark[rows[k]] = -1
-    return inside, chance
+    return inside, number, chance

@@ -15,8 +15,9 @@ class PlaneOptions:
     level: float = 0.95
     #: Least number of points; a segment counts as two.
     min_support: int = 10
-    #: Largest standard deviation of the normal, radians. One degree.
-    max_tilt: float = 0.0175
+    #: Largest standard deviation of the normal, radians. Two degrees (convention): narrow faces, such as those of legs
+    #: and boards, are known no better.
+    max_tilt: float = 0.035
     #: Least part of the features in the layer around a plane that lie on it.
     min_share: float = 0.2
     #: Expected number of planes found where there are none (convention: of tests by meaningfulness).

@@ -135,6 +135,19 @@ def _firsts(owner: IntArray, num: int) -> IntArray:
     return np.r_[0, np.cumsum(np.bincount(owner, minlength=num))]
 
 
+def log10_binomial_tail(count: int, number: int, chance: float) -> float:
+    """Return the logarithm of the probability that more than ``count`` of a number of events with a chance occur."""
+    if count < 0 or chance >= 1.0:
+        return 0.0
+    tail = float(scipy.special.bdtrc(count, number, chance))
+    if tail > 0.0:
+        return math.log10(tail)
+    # Below the smallest number the first term is nearly all of the sum.
+    first, others = count + 1, number - count - 1
+    ways = math.lgamma(number + 1) - math.lgamma(first + 1) - math.lgamma(others + 1)
+    return (ways + first * math.log(chance) + others * math.log1p(-chance)) / math.log(10.0)
+
+
 def log10_poisson_tail(count: float, mean: float) -> float:
     """Return the logarithm of the probability of more than ``count`` events where ``mean`` are expected."""
     if count < 0:
