@@ -47,8 +47,14 @@ def _adjust_points(folder: Path, model: str, is_estimated: bool) -> None:
 
 
 def _map(folder: Path) -> None:
+    from groma.evaluation import cabinet
+    from groma.io import read_scene, write_scene
 
     run(["demo", "-o", str(folder / "demo"), "--quiet"])
+    # With poses held, segments are placed anew.
+    write_scene(read_scene(cabinet.folder() / "model").subset(range(12)), folder / "model.npz")
+    held = ["--model", str(folder / "model.npz"), "--fix-poses", "-o", str(folder / "held"), "--quiet"]
+    run(["map", str(cabinet.folder() / "images"), *held])
 
 
 def _track(folder: Path) -> None:

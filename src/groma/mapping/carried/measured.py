@@ -33,7 +33,7 @@ from groma.scene import Planes, Scene
 
 #: Measurements that may be of planes; and of lines, planes or directions.
 _OF_PLANES = ("plane_observations", "distances", "known_planes", "known_directions")
-_OF_LANDMARKS = ("line_depths", *_OF_PLANES, "held")
+_OF_LANDMARKS = ("line_depths", *_OF_PLANES)
 
 
 @dataclass(frozen=True)
