@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from groma.estimators._plane_candidates import features_of
 from groma.estimators._plane_growth import tilt_loop
-from groma.estimators._plane_loops import boxes_loop, connected_loop, connected_part_loop, fit_loop, nearest_loop
+from groma.estimators._plane_loops import connected_loop, connected_part_loop, fit_loop
 from groma.estimators.plane_fit import fit_plane, tilt_sigma
 from groma.geometry.algebra import perpendicular
 
@@ -30,31 +30,6 @@ def features_at(places, segments=0):
 def linking(features):
     """What says which features are linked."""
     return features.places, features.spacing, features.partner, features.carrier, features.neighbours
-
-
-@pytest.mark.parametrize("number", [1, 7, 8, 9, 40, 200])
-def test_nearest_points_are_those_of_all(number):
-    rng = np.random.default_rng(number)
-    points = rng.normal(size=(number, 3))
-    points = points[np.argsort(points[:, 0])]
-    boxes = boxes_loop(points)
-    for bound in (0.3, 1e30):
-        for place in rng.normal(size=(12, 3)):
-            nearest, squared = np.empty(5, np.int64), np.empty(5)
-            home = int(rng.integers(number))
-            count = nearest_loop(points, boxes, place, home, bound, nearest, squared)
-            distance = ((points - place) ** 2).sum(axis=1)
-            expected = np.argsort(distance)[:5]
-            expected = expected[distance[expected] < bound]
-            assert nearest[:count].tolist() == expected.tolist()
-            np.testing.assert_allclose(squared[:count], distance[expected], rtol=1e-12)
-
-
-def test_points_at_one_place_are_not_looked_at_again_and_again():
-    points = np.zeros((100, 3))
-    nearest, squared = np.empty(3, np.int64), np.empty(3)
-    assert nearest_loop(points, boxes_loop(points), np.zeros(3), 50, 1.0, nearest, squared) == 3
-    assert (nearest // 8 == 50 // 8).all() and not squared.any()
 
 
 @pytest.mark.parametrize("seed", range(6))

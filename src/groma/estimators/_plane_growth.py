@@ -10,7 +10,6 @@ import numpy as np
 
 from groma._numba import loop
 from groma._ordering import copy, median
-from groma._trees import kd_tree, nearest
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators._plane_candidates import Features
 from groma.estimators._plane_loops import (
@@ -28,7 +27,7 @@ from groma.estimators._plane_options import PLANE_SEARCH as GATES
 from groma.estimators._plane_options import PlaneOptions
 from groma.estimators.association import MAX_SQUARE, ROUNDS, log10_binomial_tail
 from groma.estimators.plane_fit import PlaneFit, fit_with_covariance
-from groma.geometry.algebra import norm, perpendicular
+from groma.geometry.algebra import norm
 
 
 @loop
@@ -278,9 +277,6 @@ def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, pl
     -------
     (N,) bool
     """
-    if len(tested) == 0:
-        return np.zeros(0, dtype=bool)
-    basis = np.stack(perpendicular(plane[:3]), axis=1)
-    tree = kd_tree(places @ basis, balanced_tree=False, compact_nodes=False)
-    distance, _ = nearest(tree, tested @ basis, 1, np.nextafter(GATES.link * spacing.max(), np.inf))
-    return np.asarray(distance[:, 0] <= GATES.link * spacing)
+    near = np.empty(len(tested), dtype=bool)
+    connected_loop(places, np.arange(len(places)), tested, np.arange(len(tested)), spacing, GATES.link, plane, near)
+    return near

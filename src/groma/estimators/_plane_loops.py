@@ -15,13 +15,12 @@ import math
 import numpy as np
 
 from groma._numba import kernel, loop
+from groma._trees import ROUNDING, boxes_loop, nearest_loop
 
-#: Points in a ball, and points in a box that is not divided (cost: time only).
-BALL, _BOX = 64, 8
+#: Points in a ball (cost: time only).
+BALL = 64
 #: Sweeps of Jacobi rotations: convergence is quadratic, four are enough (cost: none are made after convergence).
 _SWEEPS = 12
-#: Margin of squared distances, so that features at the limit are compared by distance (derived from rounding).
-_ROUNDING = 1.0 + 1e-12
 
 
 @kernel
@@ -169,89 +168,24 @@ def layer_loop(places, balls, plane, band, out):
 
 
 @loop
-def boxes_loop(points):
-    """Boxes (2 P, 6), least and largest coordinates, of points (N, 3), near ones together: a binary tree.
-
-    Row 1 holds all, 2 k and 2 k + 1 the halves of k, the last P each a few points. Those that are empty are inverted.
-    """
-    leaves = 1
-    while leaves * _BOX < len(points):
-        leaves *= 2
-    boxes = np.empty((2 * leaves, 6))
-    for k in range(len(boxes)):
-        for c in range(3):
-            boxes[k, c], boxes[k, c + 3] = np.inf, -np.inf
-    for k in range(len(points)):
-        for c in range(3):
-            box = boxes[leaves + k // _BOX]
-            box[c], box[c + 3] = min(box[c], points[k, c]), max(box[c + 3], points[k, c])
-    for k in range(leaves - 1, 0, -1):
-        for c in range(3):
-            boxes[k, c] = min(boxes[2 * k, c], boxes[2 * k + 1, c])
-            boxes[k, c + 3] = max(boxes[2 * k, c + 3], boxes[2 * k + 1, c + 3])
-    return boxes
-
-
-@loop
-def nearest_loop(points, boxes, place, home, bound, nearest, squared):
-    """Write the nearest points to a place whose squared distances are below a bound, as many as there is room for.
-
-    Returns how many there are. It begins near the point ``home``, so that most boxes are farther than what is found.
-    """
-    count, width, level = 0, len(nearest), 0
-    x, y, z = place[0], place[1], place[2]
-    while len(boxes) >> (level + 2):
-        level += 1
-    node, first = 1, home // _BOX
-    while node > 0:
-        k = node ^ (first >> level)
-        box = boxes[k]
-        a, b, c = max(box[0] - x, x - box[3], 0.0), max(box[1] - y, y - box[4], 0.0), max(box[2] - z, z - box[5], 0.0)
-        if a * a + b * b + c * c < bound:
-            if level > 0:
-                node, level = 2 * node, level - 1
-                continue
-            begin = _BOX * (k - len(boxes) // 2)
-            for i in range(begin, min(begin + _BOX, len(points))):
-                a, b, c = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
-                far = a * a + b * b + c * c
-                if far < bound:
-                    m = min(count, width - 1)
-                    while m > 0 and squared[m - 1] > far:
-                        nearest[m], squared[m] = nearest[m - 1], squared[m - 1]
-                        m -= 1
-                    nearest[m], squared[m] = i, far
-                    count = min(count + 1, width)
-                    if count == width:
-                        bound = squared[width - 1]
-        while node & 1:
-            node, level = node >> 1, level + 1
-        if node > 0:
-            node += 1
-    return count
-
-
-@loop
 def connected_loop(places, rows, tested, which, spacing, link, plane, out):
     """Whether tested points (N, 3), projected to a plane, are within a multiple of spacings (N,) of rows of places.
 
     Only those ``which`` (K,) are tested; ``out`` (K,) is filled.
     """
-    flat, at, home = np.empty((len(rows), 3)), np.empty(3), np.int64(0)
+    flat, at = np.empty((len(rows), 3)), np.empty(3)
     nearest, squared = np.empty(1, np.int64), np.empty(1)
     for k in range(len(rows)):
         height = height_kernel(places[rows[k]], plane)
         for c in range(3):
             flat[k, c] = places[rows[k], c] - height * plane[c]
-    boxes = boxes_loop(flat)
+    boxes, first = boxes_loop(flat)
     for k in range(len(which)):
         height, reach = height_kernel(tested[which[k]], plane), link * spacing[which[k]]
         for c in range(3):
             at[c] = tested[which[k], c] - height * plane[c]
-        found = nearest_loop(flat, boxes, at, home, reach * reach * _ROUNDING, nearest, squared)
+        found = nearest_loop(flat, boxes, first, at, reach * reach * ROUNDING, nearest, squared)
         out[k] = found > 0 and math.sqrt(squared[0]) <= reach
-        if found > 0:
-            home = nearest[0]
 
 
 @kernel
@@ -277,7 +211,7 @@ def linked_loop(places, spacing, partner, neighbours, rows, rank, reach, mark, p
     """
     number, width, widest = len(rows), min(rank + 1, len(rows)), 0.0
     nearest, squared = np.empty(width, np.int64), np.empty(width)
-    points, boxes = np.empty((number, 3)), np.empty((0, 6))
+    points, boxes, first = np.empty((number, 3)), np.empty((0, 6)), np.empty(0, np.int64)
     for k in range(number):
         parent[k] = k
         widest = max(widest, spacing[rows[k]])
@@ -294,9 +228,9 @@ def linked_loop(places, spacing, partner, neighbours, rows, rank, reach, mark, p
                 count += 1
         if count < width:  # the others among its neighbours do not take part
             if len(boxes) == 0:
-                boxes = boxes_loop(points)
-            bound = (reach * widest) ** 2 * _ROUNDING
-            count = nearest_loop(points, boxes, points[k], k, bound, nearest, squared)
+                boxes, first = boxes_loop(points)
+            bound = (reach * widest) ** 2 * ROUNDING
+            count = nearest_loop(points, boxes, first, points[k], bound, nearest, squared)
         for m in range(count):
             j = nearest[m]
             x, y, z = points[j, 0] - points[k, 0], points[j, 1] - points[k, 1], points[j, 2] - points[k, 2]

@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 
 from groma import cameras as camera_models
-from groma._trees import kd_tree
+from groma._trees import kd_tree, nearest
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_in_threads, map_work
 from groma.features.segments import Segments
@@ -227,6 +227,6 @@ def _range_near(ends: FloatArray, pixel: FloatArray, inverse: FloatArray, margin
     first, second = ends[:, :2], ends[:, 2:]
     places = np.stack([first, 0.5 * (first + second), second], axis=1)
     near = min(GATES.num_near, len(pixel))
-    found = kd_tree(pixel).query(places.reshape(-1, 2), k=near)[1].reshape(len(ends), -1)
+    found = nearest(kd_tree(pixel), places.reshape(-1, 2), near)[1].reshape(len(ends), -1)
     values = inverse[found]
     return np.column_stack([values.min(1) / margin, values.max(1) * margin])
