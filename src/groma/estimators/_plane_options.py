@@ -15,7 +15,8 @@ class PlaneOptions:
     level: float = 0.95
     #: Least number of points; a segment counts as two.
     min_support: int = 10
-    #: Largest standard deviation of the normal, radians. One degree.
+    #: Largest standard deviation of the normal, radians. One degree (chosen on rendered boxes: half a degree loses
+    #: small faces; round bodies and walls have the same planes with half a degree to two).
     max_tilt: float = 0.0175
     #: Least part of the features in the layer around a plane that lie on it.
     min_share: float = 0.2
