@@ -132,3 +132,16 @@ def test_wrong_shapes_are_named():
         so3.exp(np.zeros(2))
     with pytest.raises(ShapeError, match=r"\(\.\.\., 3, 3\)"):
         so3.vee(np.zeros((4, 3)))
+
+
+def test_nearest_rotations():
+    """No rotation nearby, nor the mirror image's, has a larger trace of R^T M; rotations stay as they are."""
+    rng = np.random.default_rng(8)
+    matrix = rng.normal(size=(20, 3, 3))
+    found = so3.nearest(matrix)
+    np.testing.assert_allclose(found @ np.swapaxes(found, 1, 2), np.tile(np.eye(3), (20, 1, 1)), atol=1e-14)
+    np.testing.assert_allclose(np.linalg.det(found), 1.0, rtol=1e-14)
+    trace = np.einsum("nij,nij->n", found, matrix)
+    for other in Rotation.random(200, random_state=9).as_matrix():
+        assert (np.einsum("ij,nij->n", other, matrix) <= trace).all()
+    np.testing.assert_allclose(so3.nearest(found[0]), found[0], atol=1e-15)

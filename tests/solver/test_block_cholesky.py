@@ -43,7 +43,7 @@ def test_solves_the_system(count, width, pairs):
     for _ in range(2):  # the second time over what the first has left
         rhs = rng.normal(size=count * width)
         given = rhs.copy()
-        assert cholesky.factorize(blocks)
+        assert cholesky.factorize({(0, 0): blocks})
         np.testing.assert_allclose(matrix @ cholesky.solve(rhs), given, atol=1e-12)
         np.testing.assert_array_equal(rhs, given)
         blocks = blocks * 1.5
@@ -57,7 +57,7 @@ def test_random_graphs():
         pairs = np.unique(np.sort(ends[ends[:, 0] != ends[:, 1]], axis=1), axis=0)
         layout, blocks, matrix = system(rng, count, 6, pairs)
         cholesky = BlockCholesky(layout)
-        assert cholesky.factorize(blocks)
+        assert cholesky.factorize({(0, 0): blocks})
         rhs = rng.normal(size=6 * count)
         np.testing.assert_allclose(cholesky.solve(rhs), np.linalg.solve(matrix, rhs), atol=1e-12)
         factor = np.linalg.cholesky(_connected(pairs, count, cholesky))
@@ -75,9 +75,9 @@ def _connected(pairs, count, cholesky):
 def test_an_indefinite_system_is_refused():
     layout, blocks, _ = system(np.random.default_rng(0), 5, 6, [(i, i + 1) for i in range(4)])
     blocks[3, 2, 2] = -1.0
-    assert not BlockCholesky(layout).factorize(blocks)
+    assert not BlockCholesky(layout).factorize({(0, 0): blocks})
     blocks[3, 2, 2] = np.nan
-    assert not BlockCholesky(layout).factorize(blocks)
+    assert not BlockCholesky(layout).factorize({(0, 0): blocks})
 
 
 def test_a_chain_is_eliminated_without_fill():

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from groma._typing import FloatArray
 from groma.errors import InputError, ShapeError
 from groma.evaluation.gates import ALIGNMENT
-from groma.geometry import quaternion
+from groma.geometry import quaternion, so3
 from groma.geometry.algebra import finite_rows
 from groma.scene import Similarity
 
@@ -57,7 +57,7 @@ def align_points(source: npt.ArrayLike, target: npt.ArrayLike, with_scale: bool 
                 "fix the rotation. Use align_poses, which looks at the orientations too."
             )
     x0, y0 = x - x.mean(0), y - y.mean(0)
-    return _with_rotation(x, y, _nearest_rotation(y0.T @ x0), with_scale)
+    return _with_rotation(x, y, so3.nearest(y0.T @ x0), with_scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,7 @@ def pose_alignment(source: npt.ArrayLike, target: npt.ArrayLike, with_scale: boo
             raise InputError(f"Poses must be finite; row {row} of {name} is {poses[row].tolist()}. Leave it out.")
     x, y = camera_centers(from_source), camera_centers(from_target)
     votes = quaternion.to_matrix(from_target[:, :4]).transpose(0, 2, 1) @ quaternion.to_matrix(from_source[:, :4])
-    mean = _nearest_rotation(votes.sum(0))
+    mean = so3.nearest(votes.sum(0))
     if len(x) < 3 or min(_rank(x), _rank(y)) < 2:
         return PoseAlignment(_with_rotation(x, y, mean, with_scale), True)
     by_centers = align_points(x, y, with_scale)
@@ -141,7 +141,7 @@ def pose_alignment(source: npt.ArrayLike, target: npt.ArrayLike, with_scale: boo
         return PoseAlignment(by_centers, False)
     # Orientations that agree to rounding are as good as those that agree to a part in a million.
     weight = 2 * len(x) * by_centers.scale * max(scatter, 1e-6) ** 2 / noise**2
-    rotation = _nearest_rotation(weight * (y0.T @ x0) + votes.sum(0))
+    rotation = so3.nearest(weight * (y0.T @ x0) + votes.sum(0))
     return PoseAlignment(_with_rotation(x, y, rotation, with_scale), True)
 
 
@@ -149,13 +149,6 @@ def camera_centers(cam_from_world: npt.ArrayLike) -> FloatArray:
     r"""Return the camera centres :math:`-R^\top t` of poses (N, 7), (N, 3) in the world."""
     poses = np.asarray(cam_from_world, float)
     return -quaternion.rotate(quaternion.conjugate(poses[:, :4]), poses[:, 4:])
-
-
-def _nearest_rotation(matrix: FloatArray) -> FloatArray:
-    """Return the rotation R (3, 3) that maximises the trace of R^T M."""
-    u, _, vt = np.linalg.svd(matrix)
-    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    return u @ mirror @ vt
 
 
 def _with_rotation(x: FloatArray, y: FloatArray, rotation: FloatArray, with_scale: bool) -> Similarity:

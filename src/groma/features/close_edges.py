@@ -30,17 +30,18 @@ from groma.features.segments import Segments
 from groma.features.steps import beside, fit, profiles, two_steps
 from groma.gates import gate
 
-#: Places in halved photographs were compared with those at full size. *Much alike*: on these and on scenes not chosen
-#: on, the root mean square of the difference is at most a quarter larger than at the default.
-_CHOSEN = "chosen on halved photographs of Strecha's scenes"
-
 
 @dataclass(frozen=True)
 class CloseEdgeGates:
     """When an edge has a neighbour, and what is known of profiles beforehand."""
 
     blur: float = gate(0.75, "px", "usual blur of an edge, lens and pixel", "derived from a pixel under a sharp lens")
-    blur_spread: float = gate(0.3, "1", "standard deviation of its logarithm", f"{_CHOSEN}; 0.15 to 0.6 are much alike")
+    blur_spread: float = gate(
+        0.3,
+        "1",
+        "standard deviation of its logarithm",
+        "chosen on halved photographs of Strecha's scenes; with 0.15 to 0.6 places are up to a quarter worse",
+    )
     any_spread: float = gate(
         1.0, "1", "the same for an edge that is alone, shadows too", "derived from 0.3 to 2 pixels"
     )
@@ -49,10 +50,13 @@ class CloseEdgeGates:
         0.02,
         "1",
         "deviation of a profile from the model, over its contrast",
-        "chosen on rendered edges; 0.005 to 0.04 are much alike in halved photographs",
+        "chosen on rendered edges; with 0.005 to 0.04 places in halved photographs are up to a quarter worse",
     )
     close: float = gate(
-        2.0, "px", "from a step to the pixels that one step is fitted to", f"{_CHOSEN}; 2 to 2.5 are much alike"
+        2.0,
+        "px",
+        "from a step to the pixels that one step is fitted to",
+        "chosen on halved photographs of Strecha's scenes; with 2.5 places are up to a quarter worse, with 1.5 much",
     )
     displacement: float = gate(
         0.35, "px", "by which neighbours still displace one step", "derived from edges one to three pixels apart"

@@ -36,6 +36,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import numpy.typing as npt
 
 from groma._numba import kernel
 from groma._typing import FloatArray
@@ -247,3 +248,22 @@ def right_jacobian(omega: FloatArray) -> FloatArray:
 def right_jacobian_inverse(omega: FloatArray) -> FloatArray:
     """Inverse of :func:`right_jacobian`, (..., 3, 3); singular at an angle of 2 pi."""
     return left_jacobian_inverse(-_vectors(omega))
+
+
+def nearest(matrix: npt.ArrayLike) -> FloatArray:
+    r"""Return the rotations nearest to matrices, in the Frobenius norm: those R that maximise tr(R^T M).
+
+    .. math:: M = U S V^\top, \qquad R = U\, \mathrm{diag}(1, 1, \det U V^\top)\, V^\top
+
+    Parameters
+    ----------
+    matrix : (..., 3, 3) float64
+        Finite.
+
+    Returns
+    -------
+    (..., 3, 3) float64
+    """
+    left, _, right = np.linalg.svd(np.asarray(matrix, dtype=np.float64))
+    left[..., 2] *= np.sign(np.linalg.det(left @ right))[..., None]
+    return left @ right

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.geometry import quaternion
+from groma.geometry import quaternion, so3
 from groma.scene.pose_graph import PoseGraph
 
 if TYPE_CHECKING:
@@ -103,8 +103,6 @@ def _solved(matrix: csc_array, wanted: FloatArray, known: FloatArray, free: Bool
 def _nearest_rotations(matrices: FloatArray) -> FloatArray:
     """Return the rotations (N, 3, 3) nearest to matrices; NaN where these are not finite."""
     finite: BoolArray = np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
-    left, _, right = np.linalg.svd(np.where(finite[:, None, None], matrices, np.eye(3)))
-    left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
-    rotations = left @ right
+    rotations = so3.nearest(np.where(finite[:, None, None], matrices, np.eye(3)))
     rotations[~finite] = np.nan
     return rotations

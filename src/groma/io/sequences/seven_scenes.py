@@ -19,7 +19,7 @@ from groma._numba import loop
 from groma._typing import FloatArray
 from groma.bounded.text import read_words
 from groma.errors import FileFormatError
-from groma.geometry import se3
+from groma.geometry import se3, so3
 from groma.io.reading import reading
 from groma.io.sequences._calibration import Calibration, from_opencv, read_calibration
 from groma.io.sequences._reader import Entry, FileSequence, Preparation, Selection, simple_sequence
@@ -123,14 +123,12 @@ def _reference(root: Path, colors: list[Path]) -> Trajectory | None:
             matrix = np.array([float(word) for word in words]).reshape(4, 4)
             if not np.isfinite(matrix).all():
                 continue  # frames that were not tracked
-            u, _, vt = np.linalg.svd(matrix[:3, :3])
-            matrix[:3, :3] = u @ vt
+            matrix[:3, :3] = so3.nearest(matrix[:3, :3])
             times.append(_number(color) / RATE)
             poses.append(se3.from_matrix(matrix))
     if not poses:
         return None
     matrix = np.eye(4)
-    u, _, vt = np.linalg.svd(COLOR_FROM_DEPTH[:, :3])
-    matrix[:3, :3], matrix[:3, 3] = u @ vt, COLOR_FROM_DEPTH[:, 3]
+    matrix[:3, :3], matrix[:3, 3] = so3.nearest(COLOR_FROM_DEPTH[:, :3]), COLOR_FROM_DEPTH[:, 3]
     depth_from_color = np.broadcast_to(se3.inverse(se3.from_matrix(matrix)), (len(poses), 7))
     return Trajectory(np.array(times), se3.compose(np.array(poses), depth_from_color))

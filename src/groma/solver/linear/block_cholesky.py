@@ -22,6 +22,7 @@ from groma._simd import add_matvec, add_product, set_product, width
 from groma._typing import FloatArray, IntArray
 from groma.problem.layout import Layout
 from groma.problem.sorting import argsort_by
+from groma.solver.linear.blocks import Blocks
 from groma.solver.linear.contract import PIVOT_TOLERANCE
 from groma.solver.linear.ordering import fill_reducing_order
 
@@ -190,15 +191,15 @@ class BlockCholesky:
         """Blocks of the factor, with the diagonal."""
         return len(self._rows) + len(self._parent)
 
-    def factorize(self, S: FloatArray) -> bool:
-        """Factorise the blocks S (slots, w, w) of the layout; False if they are not positive definite."""
+    def factorize(self, blocks: Blocks) -> bool:
+        """Factorise S, given by its upper blocks; False if it is not positive definite."""
         size = self._width**2
         if not len(self._D):
             self._M, self._D = np.empty(len(self._rows) * size), np.empty(len(self._parent) * size)
         return bool(
             _factorize(
-                self._pointer, self._column, self._slot, self._flipped, self._diagonal, self._parent, S.reshape(-1),
-                self._first, self._rows, self._M, self._D, width(self._width),
+                self._pointer, self._column, self._slot, self._flipped, self._diagonal, self._parent,
+                blocks[0, 0].reshape(-1), self._first, self._rows, self._M, self._D, width(self._width),
             )
         )  # fmt: skip
 

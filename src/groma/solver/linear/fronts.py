@@ -201,8 +201,9 @@ class Fronts:
         return True
 
     def solve(self, rhs: FloatArray) -> FloatArray:
-        """Return S^-1 times the columns of ``rhs`` (unknowns, k)."""
-        x = np.array(rhs, dtype=np.float64)
+        """Return S^-1 times ``rhs`` (unknowns,), or its columns (unknowns, k)."""
+        result = np.array(rhs, dtype=np.float64)
+        x = result.reshape(len(result), -1)
         self._leaves.solve(x)
         for f, (L, below) in self._L.items():
             front = self._fronts[f]
@@ -216,7 +217,7 @@ class Fronts:
             y = x[front.unknowns[:n]] - below.T @ x[front.unknowns[n:]]
             x[front.unknowns[:n]] = solve_lower(L, y, transposed=True)
         self._leaves.solve(x, back=True)
-        return x
+        return result
 
     def inverse_on_pattern(self) -> Blocks:
         """Return the blocks of S^-1 at the places of the blocks of S."""

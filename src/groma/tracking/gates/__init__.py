@@ -54,28 +54,3 @@ class TrackingGates:
 
 #: The defaults of functions that are called without options.
 DEFAULT = TrackingGates()
-
-__all__ = [
-    "DEFAULT",
-    "CheckGates",
-    "CullingGates",
-    "DepthCheckGates",
-    "DepthGates",
-    "FeatureGates",
-    "FindingGates",
-    "FramePlaneGates",
-    "KeyframeGates",
-    "LandmarkPlaneGates",
-    "LineGates",
-    "LoopGates",
-    "MotionGates",
-    "PlaneGates",
-    "PointGates",
-    "RectificationGates",
-    "SparseDepthGates",
-    "StartGates",
-    "StereoGates",
-    "TrackingGates",
-    "TurnGates",
-    "VerificationGates",
-]
