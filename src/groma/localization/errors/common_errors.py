@@ -109,9 +109,7 @@ class CommonErrors:
         """Number of parameters of each camera that have errors."""
         return self.points.motion.shape[2] - 6
 
-    def of_query(
-        self, refined: Refined, landmarks: tuple[IntArray, IntArray], camera: int | None = None
-    ) -> FloatArray:
+    def of_query(self, refined: Refined, landmarks: tuple[IntArray, IntArray], camera: int | None = None) -> FloatArray:
         """Return what they add to the covariance (6, 6) of the pose of a query.
 
         Parameters
