@@ -265,6 +265,35 @@ def test_poses_with_too_few_votes_are_not_judged():
         assert (found.status, len(asked)) == ("localized" if enough == votes else "failed", 1)
 
 
+def test_matches_that_a_pose_crowds_together_agree_by_chance_more_often():
+    """Points that project into a strip, exchanged at random: more agree than the share of the image lets expect, and
+    the expected number of such poses stays an upper bound: of 50 not even one is significant.
+    """
+    rng, pose, evenly = np.random.default_rng(14), np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), 0.0
+    corners = CAMERA.params[2:] + np.array([(-20.0, -150.0), (20.0, 150.0)])
+    for _ in range(50):
+        pixels = rng.uniform(*corners, (300, 2))
+        rays = (pixels - CAMERA.params[2:]) / CAMERA.params[:2]
+        matches = Matches(pixels[rng.permutation(300)], 5.0 * np.column_stack([rays, np.ones(300)]))
+        found = fitted(CAMERA, matches, pose, max_errors(matches))
+        evidence = evidence_of(found, matches)
+        assert not evidence.significant
+        evenly += found.point_inliers.sum() - 300 * np.pi * found.limit / CAMERA.area
+    assert evenly > 50.0
+
+
+def test_what_speaks_against_a_pose_is_told_from_too_few_matches():
+    """Only the latter could be helped by more of them."""
+    world = make_world(np.random.default_rng(2), points=200)
+    matches = Matches(world.points2d, world.points3d)
+    for parts, status in (((9.0, 0.0), "localized"), ((1.0, 9.0), "uncertain")):
+        found = pose_from_matches(CAMERA, matches, expected=lambda best, parts=parts: (parts, 1.0))
+        assert (found.status, found.contradicted) == (status, status == "uncertain")
+    again = np.concatenate([world.points3d, world.points3d + np.array([1.5, 0.0, 0.0])])
+    two = estimate_absolute_pose(CAMERA, np.concatenate([world.points2d, world.points2d]), again)
+    assert (two.status, two.contradicted) == ("uncertain", False)
+
+
 def test_what_is_put_together_of_pieces_is_not_believed():
     rng, believed = np.random.default_rng(12), []
     for _ in range(5):

@@ -8,10 +8,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 from groma.cli.main import run
 from groma.errors import InputError
 from groma.evaluation import cabinet
+from groma.execution import work_with
 from groma.features.contract import ImageRetrieval
 from groma.geometry import quaternion, so3
 from groma.io import read_scene, write_scene
@@ -50,6 +52,14 @@ def place(tmp_path_factory):
 def localizer(place):
     """The map, described."""
     return Localizer(place / "map.npz", place / "images")
+
+
+@pytest.fixture
+def opencv_threads():
+    """Set the number of threads of OpenCV, and restore it."""
+    before = cv2.getNumThreads()
+    yield cv2.setNumThreads
+    cv2.setNumThreads(before)
 
 
 def _errors(found, truth, name):
@@ -92,6 +102,53 @@ def test_arrays_and_files_are_alike(place, localizer):
     first, second = localizer.localize(path).pose, localizer.localize(image).pose
     assert first.status == second.status == "localized"
     assert np.array_equal(first.cam_from_world, second.cam_from_world)
+
+
+@pytest.mark.parametrize(
+    ("of_points", "lines"),
+    [
+        ({"status": "localized"}, False),
+        ({"status": "uncertain"}, True),
+        ({"status": "uncertain", "contradicted": True}, False),
+        ({"status": "failed"}, True),
+    ],
+)
+def test_lines_are_matched_where_points_do_not_decide(place, localizer, monkeypatch, of_points, lines):
+    """The map has no lines; those that are matched, and what is said of the place, are given."""
+    some = localizer.localize(place / "queries" / QUERIES[0]).pose
+    said = [replace(some, status="failed"), replace(some, **of_points), replace(some, status="localized")]
+    matched = []
+
+    def pose(self, query, part, camera, options, images, found, *rest):
+        matched.append(found)
+        return said[len(matched) - 1], found
+
+    monkeypatch.setattr(Localizer, "_pose", pose)
+    monkeypatch.setattr("groma.localization.localizer.lines_alike", lambda *given: np.zeros((1, 2), np.int64))
+    found = localizer.localize(place / "queries" / QUERIES[0]).pose
+    assert found is said[1 + lines]
+    assert [len(one.lines) > 0 for one in matched] == [False, False, *[True] * lines]
+    if lines:
+        assert np.array_equal(matched[1].points, matched[2].points)
+
+
+@pytest.mark.parametrize("estimated", [(True, False), (False, False)])
+def test_the_bits_do_not_depend_on_the_number_of_threads(place, tmp_path, opencv_threads, estimated):
+    """Of the index and of poses; poses of the map estimated, or held, whose noise is estimated, too."""
+    scene = read_scene(place / "map.npz").subset(range(6))
+    bits = []
+    for threads in (1, 2):
+        opencv_threads(threads)
+        with work_with(threads), threadpool_limits(threads):
+            index = tmp_path / f"{threads}.npz"
+            localizer = Localizer(scene, place / "images", index, LocalizeOptions(estimated=estimated))
+            poses = [localizer.localize(place / "queries" / name).pose for name in QUERIES[:2]]
+        with np.load(index) as file:
+            bits.append({name: file[name].tobytes() for name in file.files})
+        for name, pose in zip(QUERIES, poses, strict=False):
+            assert pose.cam_from_world is not None
+            bits[-1][name] = pose.cam_from_world.tobytes() + pose.covariance.tobytes() + pose.sentence.encode()
+    assert bits[0] == bits[1]
 
 
 def test_what_is_not_in_the_map_is_not_found(place, localizer):

@@ -9,7 +9,7 @@ tell whether a photograph was mirrored.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,9 +21,10 @@ from groma.features.segments import Segments
 from groma.gates import gate
 from groma.localization.expected import nearest_images
 from groma.localization.features import DescribedImage, DescribedPoints, mirrored, unit
+from groma.localization.landmarks import shortened
 from groma.localization.line_matching import SeenLines, lines_near
 from groma.localization.map_index import MapIndex
-from groma.localization.matching import match_descriptors, pairs_near
+from groma.localization.matching import Vectors, match_descriptors, pairs_near
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
@@ -70,23 +71,36 @@ class Candidates:
         )
 
 
-def described_alike(
-    query: DescribedImage, scene: Scene, index: MapIndex, images: IntArray, lines: bool = True
-) -> Candidates:
-    """Match a query with some images of a map, one after the other."""
-    vectors = unit(query.points.descriptors)
-    points: list[IntArray] = [np.zeros((0, 2), np.int64)]
-    segments = points.copy()
-    determined = np.isfinite(index.line_covariance[:, 0, 0])
-    for image in images.tolist():
-        own = slice(index.begin[image], index.begin[image + 1])
-        pairs = match_descriptors(vectors, unit(index.descriptor[own]))
-        points.append(np.column_stack([pairs[:, 0], index.point[own][pairs[:, 1]]]))
-        if lines:
-            places = np.hstack([query.points.pixels[pairs[:, 0]], index.pixel[own][pairs[:, 1]]])
-            segments.append(_alike_lines(query, scene, index, image, places))
+def points_alike(points: DescribedPoints, index: MapIndex, images: IntArray, directions: Vectors) -> list[IntArray]:
+    """Match points of a query with some images of a map, one after the other, by descriptors in some directions.
+
+    Return pairs (n, 2) for each image: points of the query, and of the image.
+    """
+    short = shortened(unit(points.descriptors), directions)
+    own = (index.descriptor[index.begin[image] : index.begin[image + 1]] for image in images.tolist())
+    return [match_descriptors(short, shortened(unit(descriptor), directions)) for descriptor in own]
+
+
+def described_alike(index: MapIndex, images: IntArray, pairs: Sequence[IntArray]) -> Candidates:
+    """Return what such pairs say of the points of the map."""
+    found: list[IntArray] = [np.zeros((0, 2), np.int64)]
+    for image, (first, second) in zip(images.tolist(), (each.T for each in pairs), strict=True):
+        found.append(np.column_stack([first, index.point[index.begin[image] + second]]))
+    return Candidates(np.unique(np.concatenate(found), axis=0), np.zeros((0, 2), np.int64))
+
+
+def lines_alike(
+    query: DescribedImage, scene: Scene, index: MapIndex, images: IntArray, pairs: Sequence[IntArray]
+) -> IntArray:
+    """Pairs (m, 2) of segments of a query and lines of a map, by their surroundings and the pairs of points near them
+    in some images of the map.
+    """
+    segments: list[IntArray] = [np.zeros((0, 2), np.int64)]
+    for image, (first, second) in zip(images.tolist(), (each.T for each in pairs), strict=True):
+        places = np.hstack([query.points.pixels[first], index.pixel[index.begin[image] + second]])
+        segments.append(_alike_lines(query, scene, index, image, places))
     found = np.unique(np.concatenate(segments), axis=0)
-    return Candidates(np.unique(np.concatenate(points), axis=0), found[determined[found[:, 1]]])
+    return found[np.isfinite(index.line_covariance[found[:, 1], 0, 0])]
 
 
 def _alike_lines(query: DescribedImage, scene: Scene, index: MapIndex, image: int, places: FloatArray) -> IntArray:

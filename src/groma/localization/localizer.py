@@ -18,7 +18,15 @@ from groma.errors import InputError
 from groma.features.images import GrayImage, to_gray
 from groma.gates import gate
 from groma.io import read_scene
-from groma.localization.candidates import Candidates, MirrorImage, closest_of, described_alike, found_near
+from groma.localization.candidates import (
+    Candidates,
+    MirrorImage,
+    closest_of,
+    described_alike,
+    found_near,
+    lines_alike,
+    points_alike,
+)
 from groma.localization.expected import FoundAgain, nearest_images, shown_of
 from groma.localization.features import DescribedImage, DescribedPoints, find_features
 from groma.localization.landmarks import DescribedLandmarks, coarsest, seen_in
@@ -206,13 +214,23 @@ class Localizer:
         return self._pose(query, few, camera, options, images, matched(few.points, images), matched, enough)
 
     def _fully(self, query: DescribedImage, camera: QueryCamera, options: PoseOptions, images: IntArray) -> _Found:
-        """Match everything, lines too, with one image after the other."""
+        """Match all points with one image after the other; lines, too, if these neither place it nor speak against the
+        place.
+        """
+        directions = self._landmarks.directions
 
         def matched(points: DescribedPoints, images: IntArray) -> Candidates:
-            return described_alike(query.with_points(points), self.scene, self.index, images, lines=False)
+            return described_alike(self.index, images, points_alike(points, self.index, images, directions))
 
-        found = described_alike(query, self.scene, self.index, images, self.options.lines)
-        return self._pose(query, query, camera, options, images, found, matched)
+        pairs = points_alike(query.points, self.index, images, directions)
+        found = described_alike(self.index, images, pairs)
+        pose, last = self._pose(query, query, camera, options, images, found, matched)
+        if pose.status == "localized" or pose.contradicted or not self.options.lines:
+            return pose, last
+        lines = lines_alike(query, self.scene, self.index, images, pairs)
+        if not len(lines):
+            return pose, last
+        return self._pose(query, query, camera, options, images, replace(found, lines=lines), matched)
 
     def _pose(
         self,

@@ -62,8 +62,9 @@ class PoseOptions:
         return free_lens(camera, "all" if self.refine_lens else "none")
 
 
-#: Of so many points of a mirror image one is matched first (cost: fewer tell too little where a place repeats).
-_SOME = 2
+#: Of so many points of a mirror image one is matched first: of the most that leave so many votes, or else of the least
+#: (cost: fewer tell too little where a place repeats).
+_SOME, _VOTES = (8, 4, 2), 12
 #: Focal lengths of phones to telephoto lenses, over the longer side of the image, in steps of a fifth.
 UNKNOWN_LENS = tuple(0.5 * 1.2**step for step in range(10))
 
@@ -105,6 +106,9 @@ class AbsolutePose:
     sigma0: float = 1.0
     #: Another pose that fits about as well, where there is one.
     rival: FloatArray | None = None
+    #: Whether what agrees would do, but what else the photograph shows, or does not, speaks against the pose; more
+    #: matches would hardly change that.
+    contradicted: bool = False
 
     @property
     def center(self) -> FloatArray | None:
@@ -238,9 +242,11 @@ def pose_from_matches(
         covariance = covariance + common(best)
     distance = median_distance(best.pose, _seen(used, best))
     verdict = judge(best, covariance, distance, first, None if other is None else other[1])
+    supported = verdict.status == "localized"
     if verdict.status == "localized":
-        beyond = VERDICT.distinct * max_errors(matches)[0]
-        verdict = doubted_if_in_pieces(verdict, first.agree, cells_elsewhere(own, matches, beyond))
+        elsewhere = cells_elsewhere(own, matches, VERDICT.distinct * max_errors(matches)[0])
+        verdict = doubted_if_in_pieces(verdict, first.agree, elsewhere)
+        supported = verdict.status == "localized" or elsewhere > first.agree
     if expected is not None and verdict.status == "localized":
         parts, alone = expected(best)
         verdict = doubted_if_repeated(doubted_if_missing(verdict, *parts), alone)
@@ -261,6 +267,7 @@ def pose_from_matches(
         used,
         best.sigma0,
         None if other is None or verdict.status != "uncertain" else other[0].pose,
+        supported and verdict.status != "localized",
     )
 
 
@@ -280,9 +287,10 @@ def _unless_mirrored(
     points = matches.take(np.ones(matches.num_points, bool), np.zeros(matches.num_lines, bool))
     agree = len(np.unique(cells_of(points.points2d, own.camera, VERDICT.cells)[own.point_inliers]))
     wanted = votes_of_a_rival(agree)
-    votes = votes_of_a_part(wanted, 1.0 / _SOME)
+    parts = [(step, votes_of_a_part(wanted, 1.0 / step)) for step in _SOME]
+    step, votes = next((one for one in parts if one[1] >= _VOTES), parts[-1])
     if votes:
-        some = mirror.matches(_SOME)
+        some = mirror.matches(step)
         other = _best_of_others(own.camera, some, options, votes)
         if other is None or evidence_of(other, some).agree < votes:
             return verdict
