@@ -8,9 +8,10 @@ import pytest
 
 import groma
 from groma.adjustment.terms.relations import ANGLES
+from groma.gates import chi_square_gate
 from groma.geometry import quaternion, se3
 from groma.io import read_archive, write_archive
-from groma.mapping.structure.angles import AngleGates, right_angles, vertical_of
+from groma.mapping.structure.angles import AngleGates, _consistent, right_angles, vertical_of
 from groma.mapping.structure.find import find_structure
 from groma.mapping.unused import without_unused
 from groma.scene import Directions, KnownDirections, Planes, Relations
@@ -65,6 +66,26 @@ def test_a_room_has_all_its_right_angles(seed):
     # Seven pairs of a vector count as one deviation of it, which is at most about what vectors are uncertain by.
     assert (GATES.held < angles.sigma / np.sqrt(7 / 2)).all() and angles.sigma.max() / np.sqrt(7 / 2) < 3.0 * SIGMA
     assert angles.sigma[angles.right] == pytest.approx(np.full(len(right), angles.sigma[angles.right].mean()), rel=0.1)
+
+
+@pytest.mark.parametrize("turned", [0.0, 3.0])
+def test_what_no_pair_tells_all_of_them_may(turned):
+    """Two boxes of eight faces each, turned by so many deviations of a face."""
+    num, sigma, whole, apart = 8, 2e-3, 0, 0
+    own = [(a, b) for k in (0, num) for b in range(k, k + num) for a in range(k, b)]
+    pairs = np.array([*own, *((a, b) for a in range(num) for b in range(num, 2 * num))])
+    for seed in range(20):
+        vectors = np.repeat([X, np.cos(turned * sigma) * X + np.sin(turned * sigma) * Y], num, axis=0)
+        vectors[:, 1:] += np.random.default_rng(seed).normal(0.0, sigma, (2 * num, 2))
+        vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+        covariance = sigma**2 * (np.eye(3) - vectors[:, :, None] * vectors[:, None])
+        agree = _consistent(vectors, covariance, pairs, np.zeros(len(pairs), bool), GATES)
+        off = vectors[pairs[len(own) :, 0]] - vectors[pairs[len(own) :, 1]]
+        alone = (off**2).sum(axis=1) < chi_square_gate(0.01, 2) * 2.0 * sigma**2
+        assert alone.mean() > (0.5 if turned else 0.9)
+        whole, apart = whole + agree.all(), apart + (agree[: len(own)].all() and not agree[len(own) :].any())
+    # One draw of 20 may lose a right pair, and the means of the boxes are 6 deviations apart, for a gate of 3.9.
+    assert (apart if turned else whole) >= 17
 
 
 @pytest.mark.parametrize("degrees", [1.0, 3.0])

@@ -15,6 +15,11 @@ independent, they tell of t as much as the vectors do that they are of.
 Many pairs are tried, so they are kept, the surest first, only as long as the expected share of wrong ones among them,
 the mean of :math:`1 - P`, stays small: the false discovery rate.
 
+What no pair tells, all may: of two boxes turned by a third of a degree each face alone may be parallel to one of the
+other box; all together are not. So pairs are imposed on the vectors one by one, the surest first, each vector with a
+deviation of its own of :math:`t/\sqrt2`. A pair that contradicts those before it, by a chi-square test with the
+covariances that these leave, is dropped; that a right one is among the dropped has a probability of 5 %.
+
 An adjustment holds them with the upper end of the one-sigma interval of t, which is large where pairs are few or
 vectors uncertain. As n parallel planes have :math:`n(n-1)/2` pairs, the variance of a pair grows with the pairs that
 its two vectors are in: together they count as often as the deviation of one vector does.
@@ -69,6 +74,7 @@ class AngleGates:
         0.01, "rad", "standard deviation of an angle, above which it says nothing", "chosen on synthetic rooms"
     )
     wrong: float = gate(0.05, "share", "of wrong pairs to be expected among those kept", "convention: 5 %")
+    refused: float = gate(0.05, "probability", "that a right pair contradicts those kept before it", "convention: 5 %")
 
 
 @dataclass(frozen=True)
@@ -162,7 +168,9 @@ def right_angles(
     passed = certain & (squared < np.where(right, *(chi_square_gate(1.0 - level, freedom) for freedom in (1, 2))))
     order = np.flatnonzero(passed)[np.argsort(-told.probability[passed], kind="stable")]
     wrong = np.cumsum(1.0 - told.probability[order]) / np.arange(1, len(order) + 1)
-    kept = np.sort(order[wrong <= gates.wrong])
+    kept = order[wrong <= gates.wrong]
+    own = 0.5 * (gates.exact**2 + np.mean(told.deviation[family[kept]] ** 2)) if len(kept) else 0.0
+    kept = np.sort(kept[_consistent(vectors, covariance + own * np.eye(3), found[kept], right[kept], gates)])
     times = np.bincount(found[kept].ravel(), minlength=len(vectors))
     per_vector = max(len(kept) / max(np.count_nonzero(times), 1), 1.0)
     deviation, axes = np.zeros(6), live > 0.0
@@ -171,6 +179,41 @@ def right_angles(
         deviation[k] = _upper_end(offset[rows][axes[rows]] ** 2, variance[rows][axes[rows]], per_vector, gates)
     sigma = deviation[family[kept]] * np.sqrt(np.maximum(0.25 * times[found[kept]].sum(axis=1), 1.0))
     return Angles(found[kept], right[kept], told.probability[kept], sigma)
+
+
+def _consistent(
+    vectors: FloatArray, covariance: FloatArray, pairs: IntArray, right: BoolArray, gates: AngleGates
+) -> BoolArray:
+    """Which pairs (M,) agree with those that agree before them; vectors have their deviations in their covariances.
+
+    The state is a turn of each vector along two axes across it, with a joint covariance, as in a Kalman filter.
+    """
+    axes = np.stack(perpendicular(vectors), axis=1)
+    size, one = 2 * len(vectors), gates.held**2
+    turn, joint = np.zeros(size), np.zeros((len(vectors), 2, len(vectors), 2))
+    joint[np.arange(len(vectors)), :, np.arange(len(vectors))] = axes @ covariance @ np.swapaxes(axes, 1, 2)
+    joint, agree = joint.reshape(size, size), np.zeros(len(pairs), bool)
+    limit = [chi_square_gate(gates.refused / max(len(pairs), 1), freedom) for freedom in (2, 1)]
+    for k, (i, j) in enumerate(pairs.tolist()):
+        place = np.array([2 * i, 2 * i + 1, 2 * j, 2 * j + 1])
+        u, v = vectors[i] + turn[place[:2]] @ axes[i], vectors[j] + turn[place[2:]] @ axes[j]
+        u, v = u / np.linalg.norm(u), v / np.linalg.norm(v)
+        across = v[None] if right[k] else np.stack(perpendicular(u))
+        off = across @ (u if right[k] else v)
+        slope = np.hstack([across @ axes[i].T, (u[None] if right[k] else across) @ axes[j].T])
+        if not right[k]:
+            slope[:, :2] *= -np.sign(u @ v)
+        known = slope @ joint[np.ix_(place, place)] @ slope.T
+        agree[k] = np.trace(known) < one  # follows from those before
+        if agree[k]:
+            continue
+        known += one * np.eye(len(off))
+        agree[k] = off @ np.linalg.solve(known, off) < limit[int(right[k])]
+        if agree[k]:
+            moved = joint[:, place] @ slope.T
+            gain = np.linalg.solve(known, moved.T).T
+            turn, joint = turn - gain @ off, joint - gain @ moved.T
+    return agree
 
 
 def _worth(pairs: IntArray, family: IntArray, num: int) -> FloatArray:
