@@ -8,8 +8,8 @@
 The faces of these scenes are known, and so are their edges: which lie in one plane, which are parallel, which meet. A
 mapped line stands for the edge that it lies on; lines that are no edges of the object are left out. Recall is over all
 true pairs of usable lines and points with what enough of them share: a plane of ten points or segment ends, a direction
-of four lines. Faces that lie in one plane share it, wherever they are. Maps are kept in the cache,
-without their structure.
+of four lines. Faces that lie in one plane share it, wherever they are. Lines that meet are asked for where both
+are seen up to a tenth of their length from the corner. Maps are kept in the cache, without their structure.
 
 With --exact: lines along directions as found, the same where an edge that is turned by less than half a degree counts
 as along, and where the true directions are given exactly, those of four lines or more, or of two, so that only what
@@ -90,8 +90,9 @@ class Truth:
     direction: np.ndarray
     #: (K, 3) normals of the planes.
     normals: np.ndarray
-    #: (M, 2) lines that meet.
+    #: (M, 2) lines whose edges meet, and whether both are seen nearly up to there: others are not asked for.
     meeting: np.ndarray
+    seen: np.ndarray
 
 
 def mapped(name: str, settings: BoxSettings | BuildingSettings, cache: Path) -> tuple[RenderedScene, Scene]:
@@ -133,7 +134,7 @@ def truth_of(rendered: RenderedScene, scene: Scene) -> Truth:
     point[face >= 0] = rendered.plane_of_face[face[face >= 0]][:, None] == faces
     point &= (np.bincount(scene.point_observations.point_idx, minlength=scene.num_points) >= 3)[:, None]
     enough = point.sum(axis=0) + 2 * inside.sum(axis=0) >= 10
-    return Truth(own, inside & enough, point & enough, direction, normals, _meeting(scene, own))
+    return Truth(own, inside & enough, point & enough, direction, normals, *_meeting(scene, own))
 
 
 def _planes_of_faces(rendered: RenderedScene) -> np.ndarray:
@@ -176,23 +177,22 @@ def _edge_of_lines(scene: Scene, edges: np.ndarray) -> np.ndarray:
     return np.where(distance.min(axis=1) < near, best, -1)
 
 
-def _meeting(scene: Scene, own: np.ndarray) -> np.ndarray:
-    """(M, 2) lines whose edges meet at a corner, and that are seen up to a tenth of their length from there."""
+def _meeting(scene: Scene, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(M, 2) lines whose edges meet at a corner, and which are seen up to a tenth of their length from there."""
     first, second = np.triu_indices(len(own), 1)
     corner = own[first][:, :, None], own[second][:, None, :]
     gap = np.linalg.norm(corner[0] - corner[1], axis=3).reshape(-1, 4)
     near = np.flatnonzero(np.nan_to_num(gap, nan=1.0).min(axis=1) < EXACT)
     first, second, which = first[near], second[near], gap[near].argmin(axis=1)
     place = own[first, which // 2]
-    ends = scene.lines.segments
-    kept = np.ones(len(first), bool)
+    ends, seen = scene.lines.segments, np.ones(len(first), bool)
     for line in (first, second):
         length = np.linalg.norm(ends[line, 1] - ends[line, 0], axis=1)
-        kept &= np.linalg.norm(ends[line] - place[:, None], axis=2).min(axis=1) < 0.1 * length
+        seen &= np.linalg.norm(ends[line] - place[:, None], axis=2).min(axis=1) < 0.1 * length
     way = own[:, 1] - own[:, 0]
     crossed = np.linalg.norm(np.cross(way[first], way[second]), axis=1)
-    kept &= crossed > 0.1 * np.linalg.norm(way[first], axis=1) * np.linalg.norm(way[second], axis=1)
-    return np.column_stack([first, second])[kept]
+    kept = crossed > 0.1 * np.linalg.norm(way[first], axis=1) * np.linalg.norm(way[second], axis=1)
+    return np.column_stack([first, second])[kept], seen[kept]
 
 
 def counts(truth: Truth, scene: Scene) -> dict[str, tuple[int, int, int]]:
@@ -221,8 +221,9 @@ def counts(truth: Truth, scene: Scene) -> dict[str, tuple[int, int, int]]:
         result[name] = len(pairs), int(judged.sum() - right.sum()) + len(pairs), int(inside.sum())
     known_pairs = known[relations.lines_meeting].all(axis=1)
     found, true = (np.sort(pairs, axis=1) for pairs in (relations.lines_meeting[known_pairs], truth.meeting))
-    right = (found[:, None] == true[None]).all(axis=2).any(axis=1) if len(true) else np.zeros(len(found), bool)
-    result["lines_meeting"] = int(right.sum()), len(found), len(true)
+    same = (found[:, None] == true[None]).all(axis=2)
+    judged = len(found) - int(same[:, ~truth.seen].sum())  # others are right, though not asked for
+    result["lines_meeting"] = int(same[:, truth.seen].sum()), judged, int(truth.seen.sum())
     vectors = np.concatenate([normals, np.where((kind >= 0)[:, None], way[kind], np.nan)])
     return result | _angle_counts(vectors, scene)
 

@@ -84,8 +84,8 @@ def test_what_no_pair_tells_all_of_them_may(turned):
         alone = (off**2).sum(axis=1) < chi_square_gate(0.01, 2) * 2.0 * sigma**2
         assert alone.mean() > (0.5 if turned else 0.9)
         whole, apart = whole + agree.all(), apart + (agree[: len(own)].all() and not agree[len(own) :].any())
-    # A right pair is dropped in one draw of 20. The boxes are 6 deviations of their means apart, for a gate of 3.9.
-    assert (apart if turned else whole) >= 16 and whole * apart == 0
+    # One draw of 20 may lose a right pair, and the means of the boxes are 6 deviations apart, for a gate of 3.9.
+    assert (apart if turned else whole) >= 17
 
 
 @pytest.mark.parametrize("degrees", [1.0, 3.0])
