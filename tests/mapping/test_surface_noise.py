@@ -11,8 +11,8 @@ import pytest
 import groma
 from groma.adjustment.terms.relations import lengths_per_pixel
 from groma.mapping.noise.landmarks import project_points
-from groma.mapping.structure.find import StructureOptions, find_structure
-from groma.mapping.structure.flatness import plane_noise_px, surface_noise_px
+from groma.mapping.structure.find import StructureOptions, find_structure, landmark_noise
+from groma.mapping.structure.flatness import plane_noise_px, surface_noise_px, with_rough_planes
 from groma.scene import Directions, Planes, Relations, synthetic
 
 NOISE = 0.15
@@ -64,6 +64,24 @@ def test_each_plane_has_its_own_roughness():
     flat = plane_noise_px(found.replace(points=found.points.replace(xyz=xyz)), OPTIONS)
     assert flat[plane] < 0.3 * each[plane]
     assert (plane_noise_px(found.replace(relations=Relations()), OPTIONS) == OPTIONS.surface_sigma_px).all()
+
+
+def test_planes_that_deviate_more_have_a_deviation_of_their_own():
+    found = room(0.2)
+    noise, each = landmark_noise(found, OPTIONS), plane_noise_px(found, OPTIONS)
+    bound = float(np.median(each))
+    given = with_rough_planes(found, bound, OPTIONS, noise).relations
+    for kind, of in (("point_on_plane", "point"), ("line_on_plane", "line")):
+        landmark, plane = getattr(given, kind).T
+        own = np.where(each[plane] > bound, each[plane] * lengths_per_pixel(found, of)[landmark], 0.0)
+        np.testing.assert_array_equal(given.sigma(kind), own)
+    assert 0 < np.count_nonzero(given.sigma("point_on_plane")) < len(given.point_on_plane)
+    # What has a deviation keeps it, and nothing is asked of a scene without relations.
+    again = with_rough_planes(found.replace(relations=given), 0.0, OPTIONS, noise).relations
+    before = given.sigma("point_on_plane")
+    np.testing.assert_array_equal(again.sigma("point_on_plane")[before > 0.0], before[before > 0.0])
+    bare = found.replace(relations=Relations())
+    assert with_rough_planes(bare, bound, OPTIONS, noise).relations.point_on_plane.shape == (0, 2)
 
 
 def test_flat_walls_are_flat():

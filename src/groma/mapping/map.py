@@ -65,7 +65,7 @@ from groma.mapping.refine_points import refine_points
 from groma.mapping.result import SCENES_OF_RESULT, MapResult, result_of
 from groma.mapping.start import start_of
 from groma.mapping.structure.find import LandmarkNoise, detect_structure, landmark_noise
-from groma.mapping.structure.flatness import surface_noise_px
+from groma.mapping.structure.flatness import surface_noise_px, with_rough_planes
 from groma.mapping.surveyed import adjust_with_survey, tied
 from groma.mapping.with_depths import find_segment_depths, with_depths
 from groma.scene import Scene
@@ -246,7 +246,10 @@ def map_segments(
     if options.find_planes:
         noise = landmark_noise(scene, options.structure)
         scene = stages.run(find_planes, scene, noise)
-        weighted = dataclasses.replace(weighted, structure_sigma_px=surface_noise_px(scene, options.structure, noise))
+        flatness = surface_noise_px(scene, options.structure, noise)
+        weighted = dataclasses.replace(weighted, structure_sigma_px=flatness)
+        if not options.refine_poses:
+            scene = with_rough_planes(scene, flatness, options.structure, noise)
     if len(scene.principal_point_priors) and options.refine_intrinsics is None and options.refine_poses:
         weighted = dataclasses.replace(weighted, refine_intrinsics=None)  # of cameras whose calibration was not given
     weights = shared()

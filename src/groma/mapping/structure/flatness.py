@@ -11,9 +11,14 @@ Fitting a plane to n landmarks uses three degrees of freedom, so heights are sca
 planes with three landmarks are left out. Too small a deviation forces landmarks onto a plane; too large a one gives the
 plane no influence. The result is the upper end of the one-sigma confidence interval of t, which stays large where
 landmarks are few or noisy.
+
+A scene of floors and smooth boxes may have one wall with frames and panels before it. With cameras held, planes that
+deviate more than those of the scene have a deviation of their own (:func:`with_rough_planes`).
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -53,12 +58,12 @@ def surface_noise_px(scene: Scene, options: StructureOptions, noise: LandmarkNoi
     return _upper_end(squared, variance[told], length[told], options.surface_sigma_px)
 
 
-def plane_noise_px(scene: Scene, options: StructureOptions) -> FloatArray:
+def plane_noise_px(scene: Scene, options: StructureOptions, noise: LandmarkNoise | None = None) -> FloatArray:
     """Return the same (K,) of each plane on its own; the most where three landmarks or fewer lie on it.
 
     Parameters are those of :func:`surface_noise_px`.
     """
-    plane, height, variance, length = _heights(scene, landmark_noise(scene, options))
+    plane, height, variance, length = _heights(scene, noise or landmark_noise(scene, options))
     count = np.bincount(plane, minlength=scene.num_planes)
     out = np.full(scene.num_planes, options.surface_sigma_px)
     for k in np.flatnonzero(count > _UNKNOWNS):
@@ -66,6 +71,21 @@ def plane_noise_px(scene: Scene, options: StructureOptions) -> FloatArray:
         squared = height[of] ** 2 * count[k] / (count[k] - _UNKNOWNS)
         out[k] = _upper_end(squared, variance[of], length[of], options.surface_sigma_px)
     return out
+
+
+def with_rough_planes(scene: Scene, sigma_px: float, options: StructureOptions, noise: LandmarkNoise) -> Scene:
+    """Return the scene with the deviation of each plane that deviates by more than ``sigma_px`` in its relations.
+
+    Relations that have a deviation keep it. The other parameters are those of :func:`surface_noise_px`.
+    """
+    own, relations = plane_noise_px(scene, options, noise), scene.relations
+    sigmas = {}
+    for kind, of in (("point_on_plane", "point"), ("line_on_plane", "line")):
+        landmark, plane = getattr(relations, kind).T
+        sigma, length = relations.sigma(kind), lengths_per_pixel(scene, of)
+        rough = (sigma == 0.0) & (own[plane] > sigma_px)
+        sigmas[f"{kind}_sigma"] = np.where(rough, own[plane] * length[landmark], sigma)
+    return scene.replace(relations=replace(relations, **sigmas))
 
 
 def _upper_end(squared: FloatArray, variance: FloatArray, length: FloatArray, most: float) -> float:
