@@ -115,6 +115,17 @@ def test_too_few(count):
     assert len(directions_from_lines(np.eye(3)[np.arange(count) % 3], np.zeros((count, 3, 3)))) == 0
 
 
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_few_lines_that_are_all_parallel_are_one_direction(count):
+    """None is left that is along nothing."""
+    lines = np.tile(FRAME[0], (count, 1)) + np.random.default_rng(0).normal(0.0, 1e-6, (count, 3))
+    options = DirectionOptions(min_coincidences=count - 1, max_false_alarms=1e6)
+    found = directions_from_lines(
+        lines, np.tile(1e-10 * np.eye(3), (count, 1, 1)), options, turned=np.full(count, 1e-3)
+    )
+    assert len(found) <= 1 and (count < 3 or (found.label == 0).all())
+
+
 def test_bad_input():
     with pytest.raises(ShapeError, match="factors"):
         directions_from_normals(np.eye(3), np.zeros((2, 3, 2)))

@@ -240,7 +240,7 @@ def _best(
 
     def gains(rows: slice) -> tuple[FloatArray, FloatArray]:
         ratio = np.exp(np.minimum(members[rows] - before, 600.0))
-        part = np.full((len(ratio), 1), 3.0 / len(pool))
+        part = np.full((len(ratio), 1), min(3.0 / len(pool), 0.5))
         for _ in range(4):
             told = part * ratio
             part = (told / (1.0 - part + told)).mean(axis=1, keepdims=True)
@@ -256,11 +256,16 @@ def _best(
         if (np.abs(tried @ guesses[k]) > math.cos(wanted.apart)).any():
             continue
         tried = np.vstack([tried, guesses[k]])
-        refined = _refined(pool, before, guesses[k], float(part[k, 0]), wanted)
+        refined = _refined(pool, before, guesses[k], _share(part[k, 0]), wanted)
         new = refined is not None and (np.abs(vectors @ refined[0]) < math.cos(wanted.apart)).all()
         if refined is not None and new and (best is None or refined[2] > best[2]):
             best = refined
     return best
+
+
+def _share(part: float) -> float:
+    """A share of the lines that leaves some to this and some to other directions."""
+    return float(np.clip(part, 1e-12, 1.0 - 1e-12))
 
 
 def _refined(
@@ -275,7 +280,7 @@ def _refined(
         mine = np.exp(member - density)
         weight = mine * (PARALLEL.freedom + 2.0) / (PARALLEL.freedom + pool.squared(direction[None])[0])
         direction = _mean(pool, weight[None], direction[None])[0]
-        part = float(np.clip(mine.mean(), 1e-12, 1.0 - 1e-12))
+        part = _share(mine.mean())
     variance = np.linalg.eigvalsh(_covariance(pool, weight, direction))[1:]
     evidence = float((density - before).sum() + 0.5 * np.log(variance).sum())
     evidence += 0.5 * math.log(2.0 * math.pi * part * (1.0 - part) / len(pool))
