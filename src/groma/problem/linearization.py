@@ -227,7 +227,8 @@ class NormalEquations:
         """Form all sums at the given states and return the cost.
 
         ``after_chunk(share, chunk)`` is called as soon as the sums of a chunk's landmarks are complete, while they
-        are still in cache. Chunks that are not ``wanted`` are left out; the sums of their landmarks stay as they were.
+        are still in cache; where nothing is kept, of chunks that follow each other as one. Chunks that are not
+        ``wanted`` are left out; the sums of their landmarks stay as they were.
         """
         bases = {}
         for f, layout in enumerate(self.layout.factors):
@@ -252,8 +253,7 @@ class NormalEquations:
                         costs[f] += cost
                         degenerate[f] += count
                 if after_chunk is not None and chunk.eliminated is not None:
-                    for part in chunks:
-                        after_chunk(share, part)
+                    after_chunk(share, chunk)
                 if self.compact and chunk.eliminated is not None:
                     self._round(share, chunk)
             return costs, degenerate
