@@ -21,7 +21,7 @@ from groma._simd import width_for
 from groma._typing import FloatArray
 from groma.problem._records import chain_rule, cost_scaled, cost_whitened, mask, weigh, whiten
 from groma.problem._room import room_for_chunks, room_for_sums
-from groma.problem._sums import add_block, add_cross, add_incidence, add_primary
+from groma.problem._sums import add_block, add_costs, add_cross, add_incidence, add_primary
 from groma.problem.layout import CHUNK_SIZE, Chunk, FactorLayout, Layout, in_runs
 from groma.problem.parallel import FACTORS_ALONE, Workers, shares_of, sum_of
 
@@ -145,10 +145,7 @@ class NormalEquations:
                 hidden[f] += degenerate
                 layout = self.layout.factors[f]
                 if landmark_costs is not None and layout.eliminated is not None:
-                    landmark = layout.landmark[begin:end]
-                    first, last = int(landmark[0]), int(landmark[-1]) + 1
-                    costs = np.bincount(landmark - first, weights=rho, minlength=last - first)
-                    landmark_costs[layout.eliminated][first:last] += 0.5 * costs
+                    add_costs(rho, begin, layout.landmark, landmark_costs[layout.eliminated])
             return sums, hidden
 
         parts = self.workers.map(work, len(self.shares), self._is_little(wanted))
