@@ -19,8 +19,9 @@ from groma.execution import map_ranges
 if TYPE_CHECKING:
     from scipy.spatial import KDTree
 
-#: Places that one piece of work looks up, and points in a box that is not divided (cost: time only).
-_PLACES_AT_ONCE, _BOX = 1024, 10
+#: Places that one piece of work looks up at least, most pieces, each of which makes the boxes, and points in a box that
+#: is not divided (cost: time only).
+_PLACES_AT_ONCE, _PIECES, _BOX = 1024, 16, 10
 #: Margin of squared distances, so that points at the limit are compared by distance (derived from rounding).
 ROUNDING = 1.0 + 1e-12
 
@@ -115,9 +116,9 @@ def _distance_kernel(a, b):
 
 
 @loop
-def _nearest_points_loop(points, boxes, first, places, index, distance):
+def _nearest_points_loop(points, places, index, distance):
     """Write which points (M, n) are nearest to places (M, 3), and their distances (M, n)."""
-    squared = np.empty(index.shape[1])
+    squared, (boxes, first) = np.empty(index.shape[1]), boxes_loop(points)
     for k in range(len(places)):
         count = nearest_loop(points, boxes, first, places[k], np.inf, index[k], squared)
         for m in range(count):
@@ -138,12 +139,17 @@ def nearest(tree: KDTree, places: FloatArray, number: int) -> tuple[FloatArray, 
 
     Points have at most three dimensions.
     """
+    distance, index = nearest_in_order(tree.data[tree.indices], places, number)
+    return distance, np.append(tree.indices, tree.n)[index]
+
+
+def nearest_in_order(points: FloatArray, places: FloatArray, number: int) -> tuple[FloatArray, IntArray]:
+    """Do what :func:`nearest` does, with points (N, d) of which near ones are together."""
     distance, index = np.empty((len(places), number)), np.empty((len(places), number), np.int64)
-    points, places = (np.pad(one, ((0, 0), (0, 3 - tree.m))) for one in (tree.data[tree.indices], places))
-    boxes, first = boxes_loop(points)
+    points, places = (np.pad(one, ((0, 0), (0, 3 - one.shape[1]))) for one in (points, places))
 
     def look_up(part: slice) -> None:
-        _nearest_points_loop(points, boxes, first, places[part], index[part], distance[part])
+        _nearest_points_loop(points, places[part], index[part], distance[part])
 
-    map_ranges(look_up, len(places), _PLACES_AT_ONCE)
-    return distance, np.append(tree.indices, tree.n)[index]
+    map_ranges(look_up, len(places), max(_PLACES_AT_ONCE, -(-len(places) // _PIECES)))
+    return distance, index

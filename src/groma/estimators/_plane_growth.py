@@ -10,6 +10,7 @@ import numpy as np
 
 from groma._numba import loop
 from groma._ordering import copy, median
+from groma._trees import nearest_in_order
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators._plane_candidates import Features
 from groma.estimators._plane_loops import (
@@ -265,7 +266,7 @@ def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, pl
     Parameters
     ----------
     places : (M, 3) float64
-        Support of the plane.
+        Support of the plane, near ones together.
     tested : (N, 3) float64
         Points to test.
     spacing : (N,) float64
@@ -277,6 +278,7 @@ def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, pl
     -------
     (N,) bool
     """
-    near = np.empty(len(tested), dtype=bool)
-    connected_loop(places, np.arange(len(places)), tested, np.arange(len(tested)), spacing, GATES.link, plane, near)
-    return near
+    height, height_of_places = (at @ plane[:3] + plane[3] for at in (tested, places))
+    flat = places - height_of_places[:, None] * plane[:3]
+    distance, _ = nearest_in_order(flat, tested - height[:, None] * plane[:3], 1)
+    return np.asarray(distance[:, 0] <= GATES.link * spacing)

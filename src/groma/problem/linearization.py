@@ -21,7 +21,7 @@ from groma._simd import width_for
 from groma._typing import FloatArray
 from groma.problem._records import chain_rule, cost_scaled, cost_whitened, mask, weigh, whiten
 from groma.problem._room import room_for_chunks, room_for_sums
-from groma.problem._sums import add_block, add_cross, add_incidence, add_primary
+from groma.problem._sums import add_block, add_costs, add_cross, add_incidence, add_primary
 from groma.problem.layout import CHUNK_SIZE, Chunk, FactorLayout, Layout, in_runs
 from groma.problem.parallel import FACTORS_ALONE, Workers, shares_of, sum_of
 
@@ -145,10 +145,7 @@ class NormalEquations:
                 hidden[f] += degenerate
                 layout = self.layout.factors[f]
                 if landmark_costs is not None and layout.eliminated is not None:
-                    landmark = layout.landmark[begin:end]
-                    first, last = int(landmark[0]), int(landmark[-1]) + 1
-                    costs = np.bincount(landmark - first, weights=rho, minlength=last - first)
-                    landmark_costs[layout.eliminated][first:last] += 0.5 * costs
+                    add_costs(rho, begin, layout.landmark, landmark_costs[layout.eliminated])
             return sums, hidden
 
         parts = self.workers.map(work, len(self.shares), self._is_little(wanted))
@@ -227,7 +224,8 @@ class NormalEquations:
         """Form all sums at the given states and return the cost.
 
         ``after_chunk(share, chunk)`` is called as soon as the sums of a chunk's landmarks are complete, while they
-        are still in cache. Chunks that are not ``wanted`` are left out; the sums of their landmarks stay as they were.
+        are still in cache; where nothing is kept, of chunks that follow each other as one. Chunks that are not
+        ``wanted`` are left out; the sums of their landmarks stay as they were.
         """
         bases = {}
         for f, layout in enumerate(self.layout.factors):
@@ -252,8 +250,7 @@ class NormalEquations:
                         costs[f] += cost
                         degenerate[f] += count
                 if after_chunk is not None and chunk.eliminated is not None:
-                    for part in chunks:
-                        after_chunk(share, part)
+                    after_chunk(share, chunk)
                 if self.compact and chunk.eliminated is not None:
                     self._round(share, chunk)
             return costs, degenerate

@@ -90,14 +90,14 @@ class IndependentBlocks:
             np.array([chunk.begin for chunk in layout.chunks if chunk.eliminated == e], dtype=np.int64)
             for e in range(len(layout.eliminated))
         ]
-        self._singular: dict[tuple[int, int], int] = {}
-        self._steepest: dict[tuple[int, int], float] = {}
+        self._singular = [np.zeros(e.count, np.int64) for e in layout.eliminated]
+        self._steepest = [np.zeros(e.count) for e in layout.eliminated]
         self.reset()
 
     @property
     def num_singular(self) -> int:
         """Variables with a direction that the data do not determine."""
-        return sum(self._singular.values())
+        return sum(int(mine.sum()) for mine in self._singular)
 
     def reset(self) -> None:
         """Forget the dampings of earlier steps, and that variables have converged."""
@@ -159,7 +159,7 @@ class IndependentBlocks:
 
     def largest_gradient(self) -> float:
         """Return the largest component of the gradient, each over the root of its curvature."""
-        return float(np.sqrt(np.fromiter(self._steepest.values(), float).max(initial=0.0)))
+        return float(np.sqrt(max((mine.max(initial=0.0) for mine in self._steepest), default=0.0)))
 
     def advance(self, states: States, costs: list[FloatArray]) -> tuple[States, list[FloatArray], BlockProgress]:
         """Take the step of every variable from where they were linearised, if it lowers the variable's cost."""
@@ -216,14 +216,15 @@ class IndependentBlocks:
         self._growth[e] = np.where(better, 2.0, np.minimum(2.0 * self._growth[e], 1e6))
 
     def _invert(self, share: int, chunk: Chunk) -> None:
-        """Find the steps of the variables of one chunk."""
+        """Find the steps of the variables of one chunk, or of some that follow each other."""
         e = chunk.eliminated
         if e is not None:
             V, g = self.equations.V[e], self.equations.g_landmarks[e]
             dof = width(self.layout.eliminated[e].dof)
-            self._singular[e, chunk.begin], self._steepest[e, chunk.begin] = invert_blocks(
-                V, g, self.damping[e], 1, chunk.begin, chunk.end, self._N[e], self._h[e], dof
-            )
+            invert_blocks(
+                V, g, self.damping[e], 1, chunk.begin, chunk.end, self._N[e], self._h[e],
+                self._singular[e], self._steepest[e], dof,
+            )  # fmt: skip
 
     def _rescaled(self, states: States, costs, moved: States, new_costs, deltas, promised) -> States:
         """Return what steps lead to that are tried at another length where their cost fell otherwise than promised.

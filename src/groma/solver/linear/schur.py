@@ -46,27 +46,29 @@ PIVOT_TOLERANCE = 1e-13
 
 
 @loop
-def invert_blocks(V, g, damping, step, begin, end, N, h, dof):
+def invert_blocks(V, g, damping, step, begin, end, N, h, singular, steepest, dof):
     """N = -(V + damping D)^-1 and h = N g for landmarks begin..end; undetermined directions do not move.
 
-    The damping of landmark p is ``damping[p * step]``: one for all (step 0) or one for each (step 1). Returns how many
-    landmarks have an undetermined direction, and the largest component of the gradient, squared over its diagonal
-    entry of V: that costs nothing here, where both are in cache.
+    The damping of landmark p is ``damping[p * step]``: one for all (step 0) or one for each (step 1). So is what is
+    written: ``singular``, how many have an undetermined direction, and ``steepest``, the largest component of the
+    gradient, squared over its diagonal entry of V; for all, in addition to what is there. Both are in cache here.
     """
     n = len(dof)
     L = np.zeros((n, n))
     inverse = np.zeros((n, n))
     pivots = np.zeros(n)
-    singular, steepest = 0, 0.0
+    count, slope = 0, 0.0 if step else steepest[0]
     for p in range(begin, end):
         v0 = p * n * n
         factor = damping[p * step]
         deficient = False
+        if step:
+            slope = 0.0
         for j in range(n):
             square = g[p * n + j] * g[p * n + j]
-            if not square <= steepest * V[v0 + j * n + j] and steepest == steepest:
+            if not square <= slope * V[v0 + j * n + j] and slope == slope:
                 # What is not a number stays.
-                steepest = square / max(V[v0 + j * n + j], SMALLEST * max(square, 1.0))
+                slope = square / max(V[v0 + j * n + j], SMALLEST * max(square, 1.0))
         # V + damping D = L diag(pivots) L^T with a unit lower triangle
         for j in range(n):
             diagonal = V[v0 + j * n + j]
@@ -86,8 +88,9 @@ def invert_blocks(V, g, damping, step, begin, end, N, h, dof):
                 pivots[j] = 0.0
                 for i in range(j + 1, n):
                     L[i, j] = 0.0
-        if deficient:
-            singular += 1
+        count += deficient
+        if step:
+            singular[p], steepest[p] = deficient, slope
         for j in range(n):  # inverse of L, column by column
             for i in range(j + 1, n):
                 total = -L[i, j]
@@ -109,7 +112,8 @@ def invert_blocks(V, g, damping, step, begin, end, N, h, dof):
             for j in range(n):
                 total += N[v0 + i * n + j] * g[p * n + j]
             h[p * n + i] = total
-    return singular, steepest
+    if not step:
+        singular[0], steepest[0] = singular[0] + count, slope
 
 
 @loop
@@ -197,8 +201,7 @@ class ReducedSystem:
         self._products = _products(layout)
         kinds = [layout.problem.variables[e.group].manifold.kind for e in layout.eliminated]
         self._landmark_damping = [LANDMARK_DAMPING.get(kind, 1.0) for kind in kinds]
-        self._singular = [0] * shares
-        self._steepest: list[list[float]] = [[0.0] for _ in range(shares)]
+        self._singular, self._steepest = np.zeros((shares, 1), np.int64), np.zeros((shares, 1))
         self.num_singular_landmarks = 0
         #: Of the last steps of the landmarks: the sums of delta D delta, with D as their damping takes it, and g delta.
         self.landmark_squares = self.landmark_slope = 0.0
@@ -209,7 +212,7 @@ class ReducedSystem:
         for gradients in self._g:
             for g in gradients:
                 g[:] = 0.0
-        self._singular, self._steepest = [0] * len(self._g), [[0.0] for _ in self._g]
+        self._singular[:], self._steepest[:] = 0, 0.0
 
     def eliminate_chunk(self, share: int, chunk: Chunk, damping: float) -> None:
         """Eliminate the landmarks of one chunk of a share, whose chunks follow in their order.
@@ -222,11 +225,10 @@ class ReducedSystem:
         equations, (dof, squares, crosses) = self.equations, self._products[e]
         N, h, S, Y = self.N[e], self.h[e], self._sums.of(share), self._Y[share]
         own = np.array([damping * self._landmark_damping[e]])
-        singular, steepest = invert_blocks(
-            equations.V[e], equations.g_landmarks[e], own, 0, chunk.begin, chunk.end, N, h, dof
-        )
-        self._singular[share] += singular
-        self._steepest[share].append(steepest)
+        invert_blocks(
+            equations.V[e], equations.g_landmarks[e], own, 0, chunk.begin, chunk.end, N, h,
+            self._singular[share], self._steepest[share], dof,
+        )  # fmt: skip
         for c, pointer, block, pairs, widths in squares:
             _eliminate(
                 pointer, block, *equations.blocks_of_chunk(share, chunk, c), N, h, chunk.begin, chunk.end,
@@ -254,7 +256,7 @@ class ReducedSystem:
     def assemble(self, damping: float) -> None:
         """Add H and the damping to what landmarks left: the blocks ``S`` and the right-hand side ``rhs``."""
         layout = self.layout
-        self.num_singular_landmarks = sum(self._singular)
+        self.num_singular_landmarks = int(self._singular.sum())
         self.S: dict[tuple[int, int], FloatArray] = {}
         for pair, S in self._sums.total().items():
             a, b = layout.kept[pair[0]].width, layout.kept[pair[1]].width
@@ -281,7 +283,7 @@ class ReducedSystem:
 
     def largest_landmark_slope(self) -> float:
         """Return the largest component of the landmarks' gradient over the root of its diagonal entry of V."""
-        return float(np.sqrt(np.max([slope for slopes in self._steepest for slope in slopes])))
+        return float(np.sqrt(np.max(self._steepest)))
 
     def incident_products(self, delta_kept: list[FloatArray]) -> list[FloatArray]:
         """Return W delta_c for the landmarks of each eliminated group, (count * dof,)."""
