@@ -5,6 +5,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from groma.cameras import model
 from groma.estimators.plane_search import PlaneSet
@@ -13,6 +14,8 @@ from groma.geometry import quaternion, so3
 from groma.mapping.carried.measured import carried_depths, not_carried, ready_to_map, with_measured_planes
 from groma.scene import LineDepths, LineObservations, Lines, PlaneObservations, Planes, Scene
 from groma.scene.camera import Cameras
+
+pytestmark = pytest.mark.kernels
 
 POSES = np.hstack([quaternion.from_matrix(so3.exp(np.random.default_rng(0).normal(0, 0.1, (3, 3)))), np.eye(3)])
 
