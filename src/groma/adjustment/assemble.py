@@ -62,6 +62,7 @@ TERMS: tuple[Term, ...] = (
     relations.TERM,
     relations_in_pixels.TERM,
     camera_poses.PRIORS,
+    camera_poses.HELD_SCALE,
     principal_points.TERM,
     camera_motions.TERM,
     camera_poses.POSITIONS,
