@@ -89,11 +89,26 @@ def test_tilt_is_that_of_the_covariance_of_the_fit():
         fit_loop(features.places, features.packed, rows, weight, 10, plane, center, precision)
         fit = fit_plane(features.places, features.covariances, weight)
         expected = float(tilt_sigma(fit.covariance))
-        assert np.sqrt(tilt_loop(features.places, rows, plane, center, precision)) == pytest.approx(expected, rel=1e-6)
+        none = np.zeros_like(features.packed)
+        tilt = tilt_loop(features.places, none, rows, plane, center, precision)
+        assert np.sqrt(tilt) == pytest.approx(expected, rel=1e-6)
     on_line = features_at(np.outer(np.linspace(0, 1, 20), [1.0, 2.0, 0.5]))
     rows, plane, center = np.arange(20), np.empty(4), np.empty(3)
     fit_loop(on_line.places, on_line.packed, rows, np.ones(20), 10, plane, center, precision)
-    assert tilt_loop(on_line.places, rows, plane, center, precision) > 1.0
+    assert tilt_loop(on_line.places, on_line.packed, rows, plane, center, precision) > 1.0
+
+
+def test_noise_across_a_line_does_not_tell_a_normal():
+    """Known well in one direction and badly in another, points of a line are spread as if they lay on a plane."""
+    rng, deviation = np.random.default_rng(7), np.array([1e-3, 0.1, 1e-3])
+    rows, plane, center, precision = np.arange(200), np.empty(4), np.empty(3), np.empty(200)
+    for wide, told in ((0.0, False), (0.3, True)):
+        places = np.outer(rng.uniform(0, 3, 200), [1.0, 0, 0]) + wide * rng.uniform(-1, 1, (200, 1)) * [0, 1.0, 0]
+        features = features_at(places + deviation * rng.normal(size=(200, 3)))
+        packed = np.tile([deviation[0] ** 2, 0, 0, deviation[1] ** 2, 0, deviation[2] ** 2], (200, 1))
+        fit_loop(features.places, packed, rows, np.ones(200), 10, plane, center, precision)
+        tilt = np.sqrt(tilt_loop(features.places, packed, rows, plane, center, precision))
+        assert (tilt < 0.002) == told and (tilt > 0.005 or told)
 
 
 def test_connected_is_what_is_near_in_the_projection():

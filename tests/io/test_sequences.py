@@ -341,7 +341,7 @@ def test_video(tmp_path):
     (tmp_path / "broken.mp4").write_bytes(b"no video")
     with pytest.raises(FileFormatError, match="not a video"):
         open_sequence(tmp_path / "broken.mp4", camera="50 50 32 24")
-    with pytest.raises(InputError, match="no camera"):
+    with pytest.raises(InputError, match="No camera"):
         open_sequence(path)
 
 

@@ -41,21 +41,24 @@ def heights_loop(places, packed, rows, plane, height, spread):
 
 
 @loop
-def tilt_loop(places, rows, plane, center, precision):
-    """Largest variance of the normal of a plane fitted to rows (M,) with some precisions (M,), square radians."""
+def tilt_loop(places, packed, rows, plane, center, precision):
+    """Largest variance of the normal of a plane fitted to rows (M,) with some precisions (M,), square radians.
+
+    Features that are spread by their own noise alone, such as those of a line, do not tell it: the noise is taken off.
+    """
     s00 = s01 = s02 = s11 = s12 = s22 = 0.0
     for k in range(len(rows)):
-        i, p = rows[k], precision[k]
+        i, p, c = rows[k], precision[k], packed[rows[k]]
         x, y, z = places[i, 0] - center[0], places[i, 1] - center[1], places[i, 2] - center[2]
-        s00, s01, s02 = s00 + p * x * x, s01 + p * x * y, s02 + p * x * z
-        s11, s12, s22 = s11 + p * y * y, s12 + p * y * z, s22 + p * z * z
+        s00, s01, s02 = s00 + p * (x * x - c[0]), s01 + p * (x * y - c[1]), s02 + p * (x * z - c[2])
+        s11, s12, s22 = s11 + p * (y * y - c[3]), s12 + p * (y * z - c[4]), s22 + p * (z * z - c[5])
     # Of the three eigenvalues that of the normal is left out: the sum and the product of the other two.
     a, b, c = plane[0], plane[1], plane[2]
     total = s00 + s11 + s22 - variance_kernel((s00, s01, s02, s11, s12, s22), a, b, c)
     minors = s11 * s22 - s12 * s12, s02 * s12 - s01 * s22, s01 * s12 - s02 * s11
     others = s00 * s22 - s02 * s02, s01 * s02 - s00 * s12, s00 * s11 - s01 * s01
     product = variance_kernel(minors + others, a, b, c)
-    if not product > 0.0:
+    if not (product > 0.0 and total > 0.0):
         return np.inf
     return (0.5 * total + math.sqrt(max(0.25 * total * total - product, 0.0))) / product
 
@@ -100,7 +103,7 @@ def _refined_loop(features, labels, gates, mark, room, numbers, plane):
             largest = max(largest, abs(moved[k] - math.copysign(height[k], turned * height[k])))
         if step > 1 and largest < converged * usual:
             break
-    tilt = tilt_loop(places, room[2, :count], plane, center, precision)
+    tilt = tilt_loop(places, packed, room[2, :count], plane, center, precision)
     return count, band * median(spread[:count]) if tilt <= max_tilt**2 else 0.0
 
 

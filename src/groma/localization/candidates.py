@@ -21,10 +21,9 @@ from groma.features.segments import Segments
 from groma.gates import gate
 from groma.localization.expected import nearest_images
 from groma.localization.features import DescribedImage, DescribedPoints, mirrored, unit
-from groma.localization.landmarks import shortened
 from groma.localization.line_matching import SeenLines, lines_near
 from groma.localization.map_index import MapIndex
-from groma.localization.matching import Vectors, match_descriptors, pairs_near
+from groma.localization.matching import match_descriptors, pairs_near
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
@@ -71,14 +70,14 @@ class Candidates:
         )
 
 
-def points_alike(points: DescribedPoints, index: MapIndex, images: IntArray, directions: Vectors) -> list[IntArray]:
-    """Match points of a query with some images of a map, one after the other, by descriptors in some directions.
+def points_alike(points: DescribedPoints, index: MapIndex, images: IntArray) -> list[IntArray]:
+    """Match points of a query with some images of a map, one after the other.
 
     Return pairs (n, 2) for each image: points of the query, and of the image.
     """
-    short = shortened(unit(points.descriptors), directions)
+    vectors = unit(points.descriptors)
     own = (index.descriptor[index.begin[image] : index.begin[image + 1]] for image in images.tolist())
-    return [match_descriptors(short, shortened(unit(descriptor), directions)) for descriptor in own]
+    return [match_descriptors(vectors, unit(descriptor)) for descriptor in own]
 
 
 def described_alike(index: MapIndex, images: IntArray, pairs: Sequence[IntArray]) -> Candidates:

@@ -216,12 +216,11 @@ class Localizer:
         """Match all points with one image after the other; lines, too, if these neither place it nor speak against the
         place.
         """
-        directions = self._landmarks.directions
 
         def matched(points: DescribedPoints, images: IntArray) -> Candidates:
-            return described_alike(self.index, images, points_alike(points, self.index, images, directions))
+            return described_alike(self.index, images, points_alike(points, self.index, images))
 
-        pairs = points_alike(query.points, self.index, images, directions)
+        pairs = points_alike(query.points, self.index, images)
         found = described_alike(self.index, images, pairs)
         pose, last = self._pose(query, query, camera, options, images, found, matched)
         if pose.status == "localized" or pose.contradicted or not self.options.lines:

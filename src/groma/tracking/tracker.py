@@ -220,7 +220,7 @@ class Tracker:
             self.map, present.data, data, present.followed, present.pose, predicted, prior_sigma, watch,
             self._mapper.frame_pool,
         )  # fmt: skip
-        if estimate is None or self._verification.out_of_reach(self.map, self._motion.reach, estimate.pose):
+        if estimate is None:
             return Attempt(predicted, prior_sigma, followed=followed)
         trusted = self._verification.trusts(self.map, data, estimate)
         doubt = self._verification.is_surprised(estimate, predicted, prior_sigma)
@@ -236,10 +236,10 @@ class Tracker:
             # The previous frame is the best reference.
             mapper.keep_present(present, watch)
         with watch("find"), work_with(None if mapper.threaded else 1):
-            others = [known.pose for known in (unconfirmed, self._motion.reach) if known is not None]
+            guesses = [attempt.predicted, present.pose] + ([unconfirmed.pose] if unconfirmed is not None else [])
             found = self._verification.find(
-                self.map, data, [attempt.predicted, present.pose, *others], attempt.predicted, attempt.prior_sigma,
-                self._lost_for, self._motion, mapper.frame_pool,
+                self.map, data, guesses, attempt.predicted, attempt.prior_sigma, self._lost_for,
+                self._motion.after_gap, mapper.frame_pool,
             )  # fmt: skip
         if found is not None and not (
             attempt.trusted and unconfirmed is not None and self._verification.score(unconfirmed) >= found.score

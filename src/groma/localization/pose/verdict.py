@@ -2,10 +2,10 @@
 r"""Is the pose right: what agrees with it against what would by chance, and against the next best place.
 
 **Chance.** Under a pose that is wrong a match agrees with the probability :math:`p`, the share of the image that lies
-within its gate; or where the pose crowds the points of the matches together, as where it looks along a wall, the share
-of the part of the image that they fill. What agrees in one cell of the image counts once, since neighbouring matches
-err together. Of :math:`n` cells with matches :math:`k` agree, and three of them fix the pose. The expected number of
-poses that so many cells agree with by chance is at most
+within its gate, times how much more densely the pose puts the points of all matches than they are seen: a right one
+spreads them alike, a wrong one may crowd them, as where it looks along a wall. What agrees in one cell of the image
+counts once, since neighbouring matches err together. Of :math:`n` cells with matches :math:`k` agree, and three of them
+fix the pose. The expected number of poses that so many cells agree with by chance is at most
 
 .. math:: \text{NFA} = (n - 3) \binom{n}{k} \binom{k}{3}\, p^{\,k-3} .
 
@@ -74,7 +74,8 @@ class Verdict:
 def evidence_of(refined: Refined, matches: Matches, places: int = 1) -> Evidence:
     """Return the evidence for a pose that was looked for in so many places."""
     camera = refined.camera
-    by_chance = np.minimum(math.pi * refined.limit * refined.points.spread * _density(refined, matches), 0.5)
+    gate = math.pi * refined.limit * refined.points.spread * _crowding(refined, matches)
+    by_chance = np.minimum(gate / camera.area, 0.5)
     agree, chance = _by_cell(matches.points2d, refined.point_inliers, by_chance, camera, VERDICT.cells)
     reach = (VERDICT.search_share * max(camera.width, camera.height)) ** 2
     by_chance = np.minimum(math.pi * refined.limit * refined.lines.spread / reach, 0.5)
@@ -252,18 +253,17 @@ def median_distance(pose: FloatArray, places: FloatArray) -> float:
     return float(np.median(np.linalg.norm(places @ R_t[:3, :3].T + R_t[:3, 3], axis=1))) if len(places) else 0.0
 
 
-def _density(refined: Refined, matches: Matches) -> float:
-    r"""Mean density, per square pixel, of where a pose puts the points of all matches: :math:`n_i / (4 \pi n \sqrt{\det
-    \Sigma})` where :math:`n_i` of n are in the image, normal with the covariance :math:`\Sigma`; at least one by the
-    image.
+def _crowding(refined: Refined, matches: Matches) -> float:
+    """How much more densely a pose puts the points of all matches into the image than they are seen, at least one; with
+    the areas of normal distributions.
     """
     camera = refined.camera
     pixels = camera.project(refined.pose, matches.points3d)
     inside = pixels[camera.inside(pixels)]
     if len(inside) <= 3:
-        return 1.0 / camera.area
-    filled = 4.0 * math.pi * math.sqrt(max(float(np.linalg.det(np.cov(inside.T))), 1e-12))
-    return max(1.0 / camera.area, len(inside) / len(pixels) / filled)
+        return 1.0
+    filled, seen = (math.sqrt(max(float(np.linalg.det(np.cov(some.T))), 1e-12)) for some in (inside, matches.points2d))
+    return max(1.0, len(inside) / len(pixels) * seen / filled)
 
 
 def _by_cell(

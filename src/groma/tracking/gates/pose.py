@@ -19,12 +19,6 @@ class MotionGates:
     start: float = gate(0.15, "scene units, rad", "error of predictions before any was seen", SEQUENCES)
     safety: float = gate(3.0, "ratio", "standard deviation in terms of the errors of recent predictions", SEQUENCES)
     velocity_share: float = gate(0.5, "share", "share of the predicted motion that is added to it", SEQUENCES)
-    level: float = gate(
-        0.01,
-        "probability",
-        "of a motion as large as that over a gap; below, a place is not believed",
-        "convention: 1 %",
-    )
     learnt: float = gate(0.2, "share", "weight of the last error against earlier ones", SEQUENCES)
     last: float = gate(0.5, "share", "the error is at least this share of the last one", SEQUENCES)
 

@@ -12,7 +12,6 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.geometry import se3
 from groma.tracking.gates import DEFAULT, MotionGates
-from groma.tracking.pose.reach import MotionHistory, Reach
 
 
 class MotionModel:
@@ -28,16 +27,12 @@ class MotionModel:
         self._predicted: FloatArray | None = None
         #: Whether so many frames had no pose before the last prediction, or were missing, that it is not extrapolated.
         self.after_gap = False
-        #: Where the camera can be then, if its motion tells.
-        self.reach: Reach | None = None
-        self._history = MotionHistory(gates)
 
     def predict(self, pose: FloatArray, timestamp: float) -> tuple[FloatArray, FloatArray]:
         """Return the pose expected at a time, and the standard deviations (6,) of that expectation."""
         gap = timestamp - self._last_time if self._last_time is not None else 0.0
         steps = gap / self._step if self._step > 0 else 1.0
         self.after_gap = steps > self._gates.max_steps
-        self.reach = self._history.reach(pose, gap) if self.after_gap else None
         gap = min(gap, self._gates.max_steps * self._step) if self._step > 0 else 0.0
         twist = self._velocity * gap
         predicted = se3.compose(se3.exp(twist[None]), pose[None])[0]
@@ -58,9 +53,7 @@ class MotionModel:
                     (1.0 - self._gates.learnt) * self._error + self._gates.learnt * grouped, self._gates.last * grouped
                 )
             self._velocity = twist / self._step
-            self._history.add(twist, self._step)
         else:
-            self._history.interrupt()
             self._velocity = np.zeros(6)
             self._error = np.full(6, self._gates.start)
         self._last_time = timestamp

@@ -4,8 +4,7 @@
 A pose needs enough points and lines that agree with it, of enough that were looked at. Fewer will do where the depth of
 the frame confirms it: what the map knows to be somewhere is then measured there. Where few agree and
 depth is known, it must; and a pose that was searched must not look through what the map knows. Where nothing tells what
-the camera sees, after a loss or many missing frames, its place must stand out (:mod:`groma.tracking.pose.rivals`); and
-the camera must be able to get there (:mod:`groma.tracking.pose.reach`).
+the camera sees, after a loss or many missing frames, its place must stand out (:mod:`groma.tracking.pose.rivals`).
 """
 
 from __future__ import annotations
@@ -24,8 +23,6 @@ from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.options import TrackOptions
 from groma.tracking.pose.depth_check import depth_agreement
 from groma.tracking.pose.estimate import PoseEstimate
-from groma.tracking.pose.prediction import MotionModel
-from groma.tracking.pose.reach import Reach
 from groma.tracking.pose.relocalise import Found, find_pose, match_lines, match_near
 from groma.tracking.pose.rivals import num_cells, stands_out
 
@@ -35,8 +32,6 @@ class PoseVerification:
 
     def __init__(self, camera: TrackCamera, options: TrackOptions) -> None:
         self.camera, self.options, self.gates = camera, options, options.gates.verification
-        #: Angle that the camera has in view.
-        self._view = 2.0 * math.atan(0.5 * camera.width / camera.fx)
         self._least_evidence = self.gates.min_score if options.points or options.lines else 0.0
 
     def evidence(self, estimate: PoseEstimate) -> float:
@@ -54,13 +49,12 @@ class PoseVerification:
         shift, turn = apart(pose, predicted)
         return bool(shift < gate * np.linalg.norm(sigma[:3]) and turn < gate * np.linalg.norm(sigma[3:]))
 
-    def _says_nothing(self, track_map: TrackMap, reach: Reach | None) -> bool:
-        """Whether the motion before a gap does not tell what the camera sees."""
-        return reach is None or not reach.tells(self._view, track_map.near.depth)
-
-    def out_of_reach(self, track_map: TrackMap, reach: Reach | None, pose: FloatArray) -> bool:
-        """Whether the camera cannot have got to a place over a gap."""
-        return reach is not None and reach.denies(pose, self._view, track_map.near.depth)
+    def _says_nothing(self, track_map: TrackMap, sigma: FloatArray) -> bool:
+        """Whether a prediction does not tell what the camera sees: it may have turned by all that it has in view, or
+        moved as far as that is away.
+        """
+        view = 2.0 * math.atan(0.5 * self.camera.width / self.camera.fx)
+        return bool(np.linalg.norm(sigma[3:]) > view or np.linalg.norm(sigma[:3]) > track_map.near.depth)
 
     def trusts(self, track_map: TrackMap, data: FrameFeatures, estimate: PoseEstimate) -> bool:
         """Whether enough agrees with the pose of a frame that was followed; depth decides where that is not much."""
@@ -147,21 +141,19 @@ class PoseVerification:
         predicted: FloatArray,
         prior_sigma: FloatArray,
         lost_for: int,
-        motion: MotionModel,
+        after_gap: bool,
         pool: Executor | None = None,
     ) -> Found | None:
         """Find a frame by described features: near the last keyframes first, then anywhere.
 
-        After many frames without a pose, lost or missing, it may be in a place that looks like one of the map; but not
-        out of reach of its motion.
+        After many frames without a pose, lost or missing, it may be in a place that looks like one of the map.
         """
-        reach = motion.reach
-        alone = lost_for > self.gates.lost_frames or (motion.after_gap and self._says_nothing(track_map, reach))
+        alone = lost_for > self.gates.lost_frames or (after_gap and self._says_nothing(track_map, prior_sigma))
         if lost_for <= self.gates.lost_frames:
-            found = self.find_near(track_map, data, guesses, predicted, prior_sigma, alone, reach, pool)
+            found = self.find_near(track_map, data, guesses, predicted, prior_sigma, alone, pool)
             if found is not None:
                 return found
-        found = self.find_anywhere(track_map, data, alone, reach)
+        found = self.find_anywhere(track_map, data, alone)
         if found is None or lost_for > self.gates.lost_frames:
             return found
         return found if self.is_near(found.estimate.pose, predicted, prior_sigma) else None
@@ -174,7 +166,6 @@ class PoseVerification:
         predicted: FloatArray,
         prior_sigma: FloatArray,
         alone: bool = False,
-        reach: Reach | None = None,
         pool: Executor | None = None,
     ) -> Found | None:
         """Find a frame by described features, near the last keyframes; a part of it in a pool.
@@ -189,8 +180,6 @@ class PoseVerification:
         # Rooms are alike at both ends, in depth too: of the features in view some must agree.
         if not (found.score >= self.gates.sure or found.share >= self.gates.min_agreeing or not self.options.points):
             return None
-        if self.out_of_reach(track_map, reach, found.estimate.pose):
-            return None
         if alone and not self._stands_out(track_map, data, found):
             return None
         enough = self.evidence(found.estimate) >= self.gates.looser * self._least_evidence
@@ -198,20 +187,16 @@ class PoseVerification:
             return found
         return found if self._confirmed(nearest, data, found.estimate) else None
 
-    def find_anywhere(
-        self, track_map: TrackMap, data: FrameFeatures, alone: bool = True, reach: Reach | None = None
-    ) -> Found | None:
+    def find_anywhere(self, track_map: TrackMap, data: FrameFeatures, alone: bool = True) -> Found | None:
         """Find a frame by described features, among recent keyframes and an even choice of the others."""
         living = track_map.living()
         wide = np.array([1e3] * 3 + [10.0] * 3)
         best = None
         for keyframe in living[::-1][:: max(1, len(living) // self.gates.tried)][: self.gates.tried]:
             found = find_pose(track_map, self.camera, data, [keyframe], [], keyframe.pose, wide)
-            if found is None or self.out_of_reach(track_map, reach, found.estimate.pose):
-                continue
-            if best is None or found.score > best.score:
+            if found is not None and (best is None or found.score > best.score):
                 best = found
-            if best.score > self.gates.strong:
+            if best is not None and best.score > self.gates.strong:
                 break
         least = self.gates.sure * (1.0 if self.options.points else self.gates.looser)
         if best is None or best.score < least or best.estimate.weak:
