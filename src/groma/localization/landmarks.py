@@ -66,7 +66,7 @@ class DescribedLandmarks:
         step = max(len(index.descriptor) // gates.sample, 1)
         some = unit(index.descriptor[::step])
         directions = np.ascontiguousarray(np.linalg.eigh(some.T @ some)[1][:, -gates.dimensions :])
-        return DescribedLandmarks(directions, shortened(total, directions), upright)
+        return DescribedLandmarks(directions, _short(total, directions), upright)
 
     def match(self, points: DescribedPoints, landmarks: IntArray) -> IntArray:
         """Pairs (n, 2) of points of a query and of some points of the map that are alike."""
@@ -74,7 +74,7 @@ class DescribedLandmarks:
         for upright in (False, True):
             rows = np.flatnonzero(points.upright == upright)
             own = landmarks[self.upright[landmarks] == upright]
-            short = shortened(unit(points.descriptors[rows]), self.directions)
+            short = _short(unit(points.descriptors[rows]), self.directions)
             pairs = match_descriptors(short, self.descriptor[own])
             found.append(np.column_stack([rows[pairs[:, 0]], own[pairs[:, 1]]]))
         return np.concatenate(found)
@@ -109,7 +109,6 @@ def counted_in(index: MapIndex, images: IntArray, points: IntArray) -> IntArray:
     return np.array([wanted[index.point[index.begin[i] : index.begin[i + 1]]].sum() for i in images.tolist()], np.int64)
 
 
-def shortened(descriptors: Vectors, directions: Vectors) -> Vectors:
-    """Descriptors in some directions alone, of length one."""
+def _short(descriptors: Vectors, directions: Vectors) -> Vectors:
     short = descriptors @ directions
     return short / np.maximum(np.linalg.norm(short, axis=1, keepdims=True), np.float32(1e-6))
