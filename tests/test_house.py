@@ -126,6 +126,11 @@ def test_modules_are_short():
     assert long == LONG_MODULES
 
 
+def test_tests_and_benchmarks_are_short():
+    files = [path for folder in ("tests", "benchmarks") for path in (ROOT / folder).rglob("*.py")]
+    assert [path.name for path in files if len(path.read_text(encoding="utf-8").splitlines()) > MAX_LINES] == []
+
+
 def test_functions_are_short():
     """Of commands the list of options does not count: it is the manual."""
     long = {

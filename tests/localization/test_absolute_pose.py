@@ -1,34 +1,23 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Poses from matches: exact where matches are, as uncertain as stated, refused where there is nothing in it."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import binom
-from worlds import CAMERA, make_world, project
+from worlds import CAMERA, make_world, pose_of, project
 
 import groma
 from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion, se3, so3
-from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose, pose_from_matches
+from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
-from groma.localization.pose.pieces import cells_elsewhere
 from groma.localization.pose.refinement import _of_normal_noise, _pull, fitted, last_scale, refine
-from groma.localization.pose.verdict import evidence_of, votes_of_a_rival
 
 #: What wrong matches may still do: the loss leaves them a small weight. A pixel is 0.007 here.
 OUTLIERS = 5e-4
-
-
-def of(world, kinds, camera=CAMERA, **options):
-    """Estimate from points, lines or both."""
-    points = (world.points2d, world.points3d) if "points" in kinds else (None, None)
-    lines = (world.segments2d, world.segments3d) if "lines" in kinds else (None, None)
-    return estimate_absolute_pose(camera, *points, *lines, **options)
 
 
 @pytest.mark.parametrize("kinds", [("points",), ("lines",), ("points", "lines")])
@@ -36,7 +25,7 @@ def test_exact_matches_give_the_exact_pose(kinds):
     rng = np.random.default_rng(3)
     for _ in range(5):
         world = make_world(rng)
-        found = of(world, kinds)
+        found = pose_of(world, kinds)
         assert found.status == "localized", found.sentence
         shift, turn = world.errors(found.cam_from_world)
         assert shift < 1e-6
@@ -49,7 +38,7 @@ def test_lenses_with_distortion(model):
     numbers = {"SIMPLE_RADIAL": [600.0, 320.0, 240.0, -0.08], "OPENCV_FISHEYE": [500, 500, 320, 240, 0.02, 0.01, 0, 0]}
     camera = QueryCamera(model, np.array(numbers[model], float), 640, 480)
     world = make_world(np.random.default_rng(5), camera=camera)
-    found = of(world, ("points", "lines"), camera)
+    found = pose_of(world, ("points", "lines"), camera)
     assert found.status == "localized"
     assert max(world.errors(found.cam_from_world)) < 1e-6
 
@@ -124,7 +113,7 @@ def test_most_matches_may_be_wrong():
         points, lines = rng.permutation(100)[:60], rng.permutation(40)[:24]
         world.points3d[points] = rng.permutation(world.points3d[points])
         world.segments3d[lines] = rng.permutation(world.segments3d[lines])
-        found = of(world, ("points", "lines"), options=PoseOptions(seed=seed))
+        found = pose_of(world, ("points", "lines"), options=PoseOptions(seed=seed))
         assert found.status == "localized"
         assert max(world.errors(found.cam_from_world)) < OUTLIERS
         assert found.point_inliers.sum() == pytest.approx(40, abs=3)
@@ -167,7 +156,7 @@ def test_covariance_covers_the_noise_of_images_and_landmarks(kinds):
         across = np.column_stack([-way[:, 1], way[:, 0]]) / np.linalg.norm(way, axis=1, keepdims=True)
         world.segments2d[:] += rng.normal(0.0, 0.5, (80, 2, 1)) * across[:, None]
         known = (covariance, None) if "points" in kinds else (None, None)
-        found = of(world, kinds, sigma=(0.7, 0.5), covariances=known)
+        found = pose_of(world, kinds, sigma=(0.7, 0.5), covariances=known)
         assert found.status == "localized"
         squares.append(_normalised_error(world, found))
     # Mean of 100 chi-square variables of six degrees: 6 with a standard deviation of 0.35. The covariance may be wide
@@ -182,8 +171,8 @@ def test_landmarks_that_are_hardly_known_count_less():
         world = make_world(rng, points=60, lines=0)
         spread = np.where(np.arange(60) < 30, 0.002, 0.1)
         world.points3d[:] += spread[:, None] * rng.normal(0.0, 1.0, (60, 3))
-        told = of(world, ("points",), covariances=(spread[:, None, None] ** 2 * np.eye(3), None))
-        alike = of(world, ("points",), sigma=(5.0, 5.0))
+        told = pose_of(world, ("points",), covariances=(spread[:, None, None] ** 2 * np.eye(3), None))
+        alike = pose_of(world, ("points",), sigma=(5.0, 5.0))
         better += world.errors(told.cam_from_world)[0] < world.errors(alike.cam_from_world)[0]
     assert better >= 10
 
@@ -204,7 +193,7 @@ def test_mirrored_matches_are_not_believed():
         world = make_world(rng)
         world.points2d[:, 0] = CAMERA.width - world.points2d[:, 0]
         world.segments2d[..., 0] = CAMERA.width - world.segments2d[..., 0]
-        assert of(world, ("points", "lines")).status != "localized"
+        assert pose_of(world, ("points", "lines")).status != "localized"
 
 
 def test_two_places_that_fit_equally_well_are_told_as_two():
@@ -224,106 +213,6 @@ def test_two_places_that_fit_equally_well_are_told_as_two():
     # Where the second place has few of them, there is no doubt.
     kept = np.concatenate([np.arange(60), 60 + rng.permutation(60)[:10]])
     assert estimate_absolute_pose(CAMERA, pixels[kept], both[kept]).status == "localized"
-
-
-def _in_pieces(world, rng, moved):
-    """A world whose right half is seen ``moved`` pixels from where it is; with wrong matches."""
-    half = world.points2d[:, 0] > CAMERA.width / 2
-    points2d = np.where(half[:, None], world.points2d + moved, world.points2d)
-    wrong = rng.permutation(len(half))[: len(half) // 4]
-    points2d[wrong] = rng.uniform((0, 0), (CAMERA.width, CAMERA.height), (len(wrong), 2))
-    return points2d
-
-
-@pytest.mark.parametrize(("kinds", "share"), [("points", 1.04), ("points lines", 0.96), ("points lines", 1.0)])
-def test_a_wrong_focal_length_is_noticed(kinds, share):
-    """It is told where it is wrong, and not where it is right or estimated."""
-    rng, share = np.random.default_rng(21), np.array([share, share, 1.0, 1.0])
-    world = make_world(rng, points=150, lines=40)
-    world.points2d[:] += rng.normal(0.0, 0.5, world.points2d.shape)
-    told = replace(CAMERA, params=CAMERA.params * share)
-    found = of(world, kinds.split(), told, sigma=(0.5, 0.5))
-    wrong = share[0] != 1.0
-    assert (found.status, "focal length" in found.sentence) == (("uncertain", True) if wrong else ("localized", False))
-    if wrong:
-        assert ("shorter" if share[0] > 1.0 else "longer") in found.sentence
-    estimated = of(world, kinds.split(), told, sigma=(0.5, 0.5), options=PoseOptions(refine_lens=True))
-    assert estimated.status == "localized"
-    np.testing.assert_allclose(estimated.camera.params[:2], CAMERA.params[:2], rtol=0.01)
-
-
-def test_poses_with_too_few_votes_are_not_judged():
-    """What else would be asked of them is not."""
-    world = make_world(np.random.default_rng(2), points=200)
-    matches = Matches(world.points2d, world.points3d)
-    found = refine(CAMERA, matches, world.pose, max_errors(matches))
-    votes = evidence_of(found, matches).agree
-    asked = []
-    for enough in (votes, votes + 1):
-        expected = lambda best: asked.append(best) or ((9.0, 0.0), 1.0)  # noqa: E731
-        found = pose_from_matches(CAMERA, matches, expected=expected, enough=enough)
-        assert (found.status, len(asked)) == ("localized" if enough == votes else "failed", 1)
-
-
-def test_a_pose_that_crowds_points_has_less_evidence():
-    """Twelve matches agree; the pose puts the points of all others, which are seen all over the image, evenly or into a
-    strip.
-    """
-    rng, pose = np.random.default_rng(14), np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-    middle, half = CAMERA.params[2:], np.array([200.0, 150.0])
-    agree = middle + rng.uniform(-1.0, 1.0, (12, 2)) * [20.0, 150.0]
-    seen = np.concatenate([agree, middle + rng.uniform(-1.0, 1.0, (150, 2)) * half])
-    alarms = []
-    for width in (200.0, 20.0):
-        put = np.concatenate([agree, middle + rng.uniform(-1.0, 1.0, (150, 2)) * [width, 150.0]])
-        rays = np.column_stack([(put - middle) / CAMERA.params[:2], np.ones(len(put))])
-        matches = Matches(seen, 5.0 * rays)
-        alarms.append(evidence_of(fitted(CAMERA, matches, pose, max_errors(matches)), matches).log_alarms)
-    # Some nine of ten factors of about ten.
-    assert alarms[1] > alarms[0] + 10.0
-
-
-def test_what_speaks_against_a_pose_is_told_from_too_few_matches():
-    """Only the latter could be helped by more of them."""
-    world = make_world(np.random.default_rng(2), points=200)
-    matches = Matches(world.points2d, world.points3d)
-    for parts, status in (((9.0, 0.0), "localized"), ((1.0, 9.0), "uncertain")):
-        found = pose_from_matches(CAMERA, matches, expected=lambda best, parts=parts: (parts, 1.0))
-        assert (found.status, found.contradicted) == (status, status == "uncertain")
-    again = np.concatenate([world.points3d, world.points3d + np.array([1.5, 0.0, 0.0])])
-    two = estimate_absolute_pose(CAMERA, np.concatenate([world.points2d, world.points2d]), again)
-    assert (two.status, two.contradicted) == ("uncertain", False)
-
-
-def test_what_is_put_together_of_pieces_is_not_believed():
-    rng, believed = np.random.default_rng(12), []
-    for _ in range(5):
-        world = make_world(rng, points=300)
-        pieces = estimate_absolute_pose(CAMERA, _in_pieces(world, rng, [0.0, 150.0]), world.points3d)
-        assert pieces.status == "uncertain", pieces.sentence
-        whole = estimate_absolute_pose(CAMERA, _in_pieces(world, rng, [0.0, 0.0]), world.points3d)
-        believed.append(whole.status)
-    assert believed == ["localized"] * 5
-
-
-def test_cells_that_are_off_like_their_neighbours_are_counted():
-    rng = np.random.default_rng(13)
-    world = make_world(rng, points=300, lines=0)
-    pose = np.array(world.pose)
-    for moved, wrong, low, high in (([0.0, 150.0], 0, 100, 160), ([0.0, 0.0], 0, 0, 0), ([0.0, 0.0], 150, 0, 20)):
-        pixels = world.points2d + np.where(world.points2d[:, :1] > CAMERA.width / 2, moved, 0.0)
-        rows = rng.permutation(300)[:wrong]
-        pixels[rows] = rng.uniform((0, 0), (CAMERA.width, CAMERA.height), (wrong, 2))
-        matches = Matches(pixels, world.points3d)
-        found = fitted(CAMERA, matches, pose, (7.0, 7.0))
-        assert low <= cells_elsewhere(found, matches, 34.0) <= high
-
-
-def test_a_rival_needs_so_many_votes():
-    for agree in (5, 40, 400):
-        votes = votes_of_a_rival(agree)
-        assert 2.0 * binom.cdf(votes, agree + votes, 0.5) > 1e-3
-        assert votes == 0 or 2.0 * binom.cdf(votes - 1, agree + votes - 1, 0.5) <= 1e-3
 
 
 def test_points_on_a_line_do_not_determine_a_pose():
@@ -354,7 +243,7 @@ def test_an_unknown_lens_is_estimated():
     from groma.localization.pose.absolute_pose import UNKNOWN_LENS
 
     options = PoseOptions(refine_lens=True, focal_factors=UNKNOWN_LENS)
-    found = of(world, ("points",), start, options=options)
+    found = pose_of(world, ("points",), start, options=options)
     assert found.status == "localized"
     assert found.camera.params == pytest.approx(lens.params, rel=1e-4, abs=1e-5)
     assert max(world.errors(found.cam_from_world)) < 1e-4
@@ -367,8 +256,8 @@ def test_an_estimated_lens_makes_the_pose_less_certain():
     for _ in range(40):
         world = make_world(rng, points=120, lines=0, camera=lens)
         world.points2d[:] += rng.normal(0.0, 1.0, world.points2d.shape)
-        found = of(world, ("points",), lens, options=PoseOptions(refine_lens=True))
-        known = of(world, ("points",), lens)
+        found = pose_of(world, ("points",), lens, options=PoseOptions(refine_lens=True))
+        known = pose_of(world, ("points",), lens)
         assert found.center_sigma is not None and known.center_sigma is not None
         sigmas.append(np.linalg.norm(found.center_sigma) / np.linalg.norm(known.center_sigma))
         squares.append(_normalised_error(world, found))
@@ -379,7 +268,7 @@ def test_an_estimated_lens_makes_the_pose_less_certain():
 def test_the_same_seed_gives_the_same_pose_and_arguments_stay():
     world = make_world(np.random.default_rng(47))
     before = world.points2d.copy(), world.segments3d.copy()
-    first, second = of(world, ("points", "lines")), of(world, ("points", "lines"))
+    first, second = pose_of(world, ("points", "lines")), pose_of(world, ("points", "lines"))
     assert first.cam_from_world is not None and second.cam_from_world is not None
     assert np.array_equal(first.cam_from_world, second.cam_from_world)
     assert np.array_equal(before[0], world.points2d) and np.array_equal(before[1], world.segments3d)

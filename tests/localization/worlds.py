@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma.geometry import quaternion, so3
+from groma.localization.pose.absolute_pose import estimate_absolute_pose
 from groma.localization.pose.camera import QueryCamera
 
 CAMERA = QueryCamera("PINHOLE", np.array([600.0, 610.0, 330.0, 235.0]), 640, 480)
@@ -51,3 +52,10 @@ def make_world(rng, points=60, lines=20, camera=CAMERA):
     share = np.sort(rng.uniform(-0.05, 1.05, (lines, 2, 1)), axis=1)
     pieces = ends[:, :1] + share * (ends[:, 1:] - ends[:, :1])  # a detected segment ends elsewhere than the line
     return World(pose, project(camera, pose, X), X, project(camera, pose, pieces), ends)
+
+
+def pose_of(world, kinds, camera=CAMERA, **options):
+    """Estimate from points, lines or both."""
+    points = (world.points2d, world.points3d) if "points" in kinds else (None, None)
+    lines = (world.segments2d, world.segments3d) if "lines" in kinds else (None, None)
+    return estimate_absolute_pose(camera, *points, *lines, **options)

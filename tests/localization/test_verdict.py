@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What is said of a pose: by what agrees with it, what would by chance, and what speaks against it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+from worlds import CAMERA, make_world, pose_of
+
+from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose, pose_from_matches
+from groma.localization.pose.hypotheses import max_errors
+from groma.localization.pose.matches import Matches
+from groma.localization.pose.pieces import cells_elsewhere
+from groma.localization.pose.refinement import fitted, refine
+from groma.localization.pose.verdict import evidence_of, votes_of_a_rival
+
+
+def _in_pieces(world, rng, moved):
+    """A world whose right half is seen ``moved`` pixels from where it is; with wrong matches."""
+    half = world.points2d[:, 0] > CAMERA.width / 2
+    points2d = np.where(half[:, None], world.points2d + moved, world.points2d)
+    wrong = rng.permutation(len(half))[: len(half) // 4]
+    points2d[wrong] = rng.uniform((0, 0), (CAMERA.width, CAMERA.height), (len(wrong), 2))
+    return points2d
+
+
+@pytest.mark.parametrize(("kinds", "share"), [("points", 1.04), ("points lines", 0.96), ("points lines", 1.0)])
+def test_a_wrong_focal_length_is_noticed(kinds, share):
+    """It is told where it is wrong, and not where it is right or estimated."""
+    rng, share = np.random.default_rng(21), np.array([share, share, 1.0, 1.0])
+    world = make_world(rng, points=150, lines=40)
+    world.points2d[:] += rng.normal(0.0, 0.5, world.points2d.shape)
+    told = replace(CAMERA, params=CAMERA.params * share)
+    found = pose_of(world, kinds.split(), told, sigma=(0.5, 0.5))
+    wrong = share[0] != 1.0
+    assert (found.status, "focal length" in found.sentence) == (("uncertain", True) if wrong else ("localized", False))
+    if wrong:
+        assert ("shorter" if share[0] > 1.0 else "longer") in found.sentence
+    estimated = pose_of(world, kinds.split(), told, sigma=(0.5, 0.5), options=PoseOptions(refine_lens=True))
+    assert estimated.status == "localized"
+    np.testing.assert_allclose(estimated.camera.params[:2], CAMERA.params[:2], rtol=0.01)
+
+
+def test_poses_with_too_few_votes_are_not_judged():
+    """What else would be asked of them is not."""
+    world = make_world(np.random.default_rng(2), points=200)
+    matches = Matches(world.points2d, world.points3d)
+    found = refine(CAMERA, matches, world.pose, max_errors(matches))
+    votes = evidence_of(found, matches).agree
+    asked = []
+    for enough in (votes, votes + 1):
+        expected = lambda best: asked.append(best) or ((9.0, 0.0), 1.0)  # noqa: E731
+        found = pose_from_matches(CAMERA, matches, expected=expected, enough=enough)
+        assert (found.status, len(asked)) == ("localized" if enough == votes else "failed", 1)
+
+
+def test_a_pose_that_crowds_points_has_less_evidence():
+    """Twelve matches agree; the pose puts the points of all others, which are seen all over the image, evenly or into a
+    strip.
+    """
+    rng, pose = np.random.default_rng(14), np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    middle, half = CAMERA.params[2:], np.array([200.0, 150.0])
+    agree = middle + rng.uniform(-1.0, 1.0, (12, 2)) * [20.0, 150.0]
+    seen = np.concatenate([agree, middle + rng.uniform(-1.0, 1.0, (150, 2)) * half])
+    alarms = []
+    for width in (200.0, 20.0):
+        put = np.concatenate([agree, middle + rng.uniform(-1.0, 1.0, (150, 2)) * [width, 150.0]])
+        rays = np.column_stack([(put - middle) / CAMERA.params[:2], np.ones(len(put))])
+        matches = Matches(seen, 5.0 * rays)
+        alarms.append(evidence_of(fitted(CAMERA, matches, pose, max_errors(matches)), matches).log_alarms)
+    # Some nine of ten factors of about ten.
+    assert alarms[1] > alarms[0] + 10.0
+
+
+def test_what_speaks_against_a_pose_is_told_from_too_few_matches():
+    """Only the latter could be helped by more of them."""
+    world = make_world(np.random.default_rng(2), points=200)
+    matches = Matches(world.points2d, world.points3d)
+    for parts, status in (((9.0, 0.0), "localized"), ((1.0, 9.0), "uncertain")):
+        found = pose_from_matches(CAMERA, matches, expected=lambda best, parts=parts: (parts, 1.0))
+        assert (found.status, found.contradicted) == (status, status == "uncertain")
+    again = np.concatenate([world.points3d, world.points3d + np.array([1.5, 0.0, 0.0])])
+    two = estimate_absolute_pose(CAMERA, np.concatenate([world.points2d, world.points2d]), again)
+    assert (two.status, two.contradicted) == ("uncertain", False)
+
+
+def test_what_is_put_together_of_pieces_is_not_believed():
+    rng, believed = np.random.default_rng(12), []
+    for _ in range(5):
+        world = make_world(rng, points=300)
+        pieces = estimate_absolute_pose(CAMERA, _in_pieces(world, rng, [0.0, 150.0]), world.points3d)
+        assert pieces.status == "uncertain", pieces.sentence
+        whole = estimate_absolute_pose(CAMERA, _in_pieces(world, rng, [0.0, 0.0]), world.points3d)
+        believed.append(whole.status)
+    assert believed == ["localized"] * 5
+
+
+def test_cells_that_are_off_like_their_neighbours_are_counted():
+    rng = np.random.default_rng(13)
+    world = make_world(rng, points=300, lines=0)
+    pose = np.array(world.pose)
+    for moved, wrong, low, high in (([0.0, 150.0], 0, 100, 160), ([0.0, 0.0], 0, 0, 0), ([0.0, 0.0], 150, 0, 20)):
+        pixels = world.points2d + np.where(world.points2d[:, :1] > CAMERA.width / 2, moved, 0.0)
+        rows = rng.permutation(300)[:wrong]
+        pixels[rows] = rng.uniform((0, 0), (CAMERA.width, CAMERA.height), (wrong, 2))
+        matches = Matches(pixels, world.points3d)
+        found = fitted(CAMERA, matches, pose, (7.0, 7.0))
+        assert low <= cells_elsewhere(found, matches, 34.0) <= high
+
+
+def test_a_rival_needs_so_many_votes():
+    for agree in (5, 40, 400):
+        votes = votes_of_a_rival(agree)
+        assert 2.0 * binom.cdf(votes, agree + votes, 0.5) > 1e-3
+        assert votes == 0 or 2.0 * binom.cdf(votes - 1, agree + votes - 1, 0.5) <= 1e-3
