@@ -17,14 +17,13 @@ from typing import Any
 from numba import njit
 
 from groma._kernels.cache import keep_on_disk
-from groma._kernels.inner import Pipeline
+from groma._kernels.inner import ARITHMETIC, Pipeline
 
 _OPTIONS = {
     "pipeline_class": Pipeline,
     "nogil": True,
     "no_cfunc_wrapper": True,  # for callers in C, of which there are none
-    "error_model": "numpy",
-    "fastmath": {"contract", "reassoc", "nsz", "arcp"},
+    **ARITHMETIC,
 }
 
 

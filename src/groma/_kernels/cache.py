@@ -234,8 +234,6 @@ class _Cache(FunctionCache):
         if not self._is_ours and not found.is_complete:
             return None
         variant = "for linking" if kernel_inner.is_inside() else "for Python"
-        if not self._is_ours:
-            variant += kernel_inner.inherited()
         content = _digest((kernel_digest.environment(), kinds, processor, found.content, variant))
         return _Key(_digest((kinds, processor, found.selected, variant)), content)
 

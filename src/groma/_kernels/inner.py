@@ -7,6 +7,9 @@ and no more: it is optimised as part of what it is inlined into. If Python calls
 once more, in full. Wrappers are not optimised: a call takes 20 nanoseconds more, of half a microsecond, and compiling a
 seventh less. Numba's own functions that ours call, such as ``np.empty``, are compiled in the same way, and kept.
 
+What comes out depends on sources alone, not on what was compiled before, by this process or others: of a function that
+Python has called, too, the form for linking is linked, and names are digests.
+
 In come the pipeline and the libraries of Numba's compiler; out comes ``Pipeline``, which ``numba.njit`` is told to use.
 A version of Numba that is not known here compiles in its own way, every function in full.
 """
@@ -15,21 +18,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import llvmlite.binding as llvm
 import numba
+from numba.core.bytecode import FunctionIdentity
 from numba.core.caching import CompileResultCacheImpl
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler, CompileResult
+from numba.core.compiler import Compiler, CompileResult, Flags
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.compiler_machinery import PassManager
+from numba.core.cpu_options import FastMathOptions
 from numba.core.sigutils import normalize_signature
 from numba.core.targetconfig import ConfigStack
 from numba.core.typed_passes import NativeLowering as NumbaLowering
 from numba.core.typed_passes import NopythonTypeInference
 from numba.core.typing.templates import _OverloadFunctionTemplate
 
+from groma._kernels.digest import dependence
 from groma._kernels.elements import NativeLowering
 from groma._kernels.lifetimes import on_demand
 from groma._kernels.loading import rebuilt
@@ -39,6 +46,20 @@ from groma._kernels.shortcuts import TypeInference, remembering
 is_known = (0, 66) <= tuple(map(int, numba.__version__.split(".")[:2])) < (0, 69)
 #: Steps of Numba's compiler, and what takes their place.
 OURS = {NumbaLowering: NativeLowering, NopythonTypeInference: TypeInference}
+
+
+class _InOrder(set[str]):
+    """A set whose text is the same in every process: Numba writes it into the names of functions."""
+
+    def copy(self) -> _InOrder:
+        return self
+
+    def __repr__(self) -> str:
+        return repr(sorted(self))
+
+
+#: What operations mean: division by zero, and which of them may be exchanged.
+ARITHMETIC = {"error_model": "numpy", "fastmath": _InOrder(("contract", "reassoc", "nsz", "arcp"))}
 #: How the names of wrappers begin.
 _WRAPPER = "_ZN7cpython"
 #: How many functions are being compiled: one inside the other. Numba compiles in one thread at a time.
@@ -48,12 +69,6 @@ _depth = 0
 def is_inside() -> bool:
     """Whether a function is being compiled, so that what is asked for is for linking."""
     return _depth > 0
-
-
-def inherited() -> str:
-    """Return what a function of Numba's takes over from the one that is being compiled (``CPUTargetOptions``)."""
-    flags: Any = ConfigStack.top_or_none()
-    return repr(flags and (sorted(flags.fastmath.flags), flags.error_model, flags.forceinline, flags.nrt))
 
 
 @contextmanager
@@ -151,7 +166,9 @@ class Pipeline(Compiler):
             kind = _InnerLibrary if _depth > 1 else _Library
             state.library = kind(state.targetctx.codegen(), state.func_id.func_qualname)
             state.library.enable_object_caching()
-            if kind is _InnerLibrary:
+            if kind is _Library:  # of two equal functions, each is called by its own name
+                state.func_id.unique_id = next(FunctionIdentity._unique_ids)
+            else:
                 state.flags.no_compile = state.flags.no_cpython_wrapper = state.flags.no_cfunc_wrapper = True
         pipelines = super().define_pipelines()
         return [_ours(pipeline) for pipeline in pipelines]
@@ -209,45 +226,83 @@ class Results(CompileResultCacheImpl):
         )
 
 
+@cache
+def _inherited() -> Flags:
+    """Return what Numba's functions take over from their caller, here the same for all callers: they are kept once."""
+    flags: Any = Flags()
+    flags.nrt, flags.forceinline = True, False
+    flags.error_model, flags.fastmath = ARITHMETIC["error_model"], FastMathOptions(ARITHMETIC["fastmath"])
+    return flags
+
+
 def tell_apart(dispatcher: Any, keep: Callable[[Any], Any]) -> None:
     """Keep what has no machine code from Python, which gets it compiled in full; ``keep`` is for Numba's functions."""
     kind = type(dispatcher)
+    linked: dict[tuple, Any] = {}
 
     def compile_for_caller(signature: Any) -> Any:
         with global_compiler_lock:
+            if not is_known:
+                return kind.compile(dispatcher, signature)
             arguments = tuple(normalize_signature(signature)[0])
             found = dispatcher.overloads.get(arguments)
-            if _depth or not is_known:
-                return kind.compile(dispatcher, signature)
-            if found is not None and isinstance(found.entry_point, _NoMachineCode):
-                del dispatcher.overloads[arguments]
-            with on_demand(), remembering(), _keeping_overloads(keep):
-                return kind.compile(dispatcher, signature)
+            if not _depth:
+                if found is not None and isinstance(found.entry_point, _NoMachineCode):
+                    del dispatcher.overloads[arguments]
+                with on_demand(), remembering(), _keeping_overloads(keep):
+                    return kind.compile(dispatcher, signature)
+            if arguments in linked:
+                return linked[arguments].entry_point
+            dispatcher.overloads.pop(arguments, None)
+            try:
+                with ConfigStack().enter(_inherited()):
+                    return kind.compile(dispatcher, signature)
+            finally:
+                if found is not None:
+                    dispatcher.overloads[arguments] = found
 
     def add_overload(result: Any) -> None:
+        arguments = tuple(result.signature.args)
         if isinstance(result.entry_point, _NoMachineCode):
-            dispatcher.overloads[tuple(result.signature.args)] = result
+            dispatcher.overloads[arguments] = linked[arguments] = result
         else:
             kind.add_overload(dispatcher, result)
 
+    def get_overload(signature: Any) -> Any:
+        found = linked.get(tuple(normalize_signature(signature)[0])) if _depth else None
+        return kind.get_overload(dispatcher, signature) if found is None else found.entry_point
+
     dispatcher.compile = compile_for_caller
     dispatcher.add_overload = add_overload
+    dispatcher.get_overload = get_overload
 
 
 _decorator = _OverloadFunctionTemplate._get_jit_decorator
+_identity: Any = FunctionIdentity.from_function.__func__
 
 
 @contextmanager
 def _keeping_overloads(keep: Callable[[Any], Any]) -> Iterator[None]:
-    """Compile Numba's own functions for linking, and keep them; for a thread that holds the lock of the compiler."""
+    """Compile Numba's own functions for linking, and keep them; for a thread that holds the lock of the compiler.
+
+    What is linked gets names that are the same in all processes. Numba counts, so that a function that comes into a
+    loop by way of two others would be there twice if two processes had kept them, and last digits would hang on it.
+    """
 
     def find_decorator(self: Any) -> Any:
         decorator = _decorator(self)
         return lambda **options: lambda made: keep(decorator(**{"pipeline_class": Pipeline, **options})(made))
 
-    before = _OverloadFunctionTemplate._get_jit_decorator
-    _OverloadFunctionTemplate._get_jit_decorator = find_decorator
+    def identify(kind: Any, function: Any) -> Any:
+        identity = _identity(kind, function)
+        identity.unique_id = dependence(function, ()).content[:16]
+        identity.unique_name = f"{identity.func_qualname}${identity.unique_id}"
+        return identity
+
+    templates: Any = _OverloadFunctionTemplate
+    identities: Any = FunctionIdentity
+    templates._get_jit_decorator, identities.from_function = find_decorator, classmethod(identify)
     try:
         yield
     finally:
-        _OverloadFunctionTemplate._get_jit_decorator = before
+        templates._get_jit_decorator, identities.from_function = _decorator, classmethod(_identity)
