@@ -168,7 +168,8 @@ def _points_near(
     point = np.flatnonzero(seen)
     expected = np.full((len(index.xyz), 2), np.nan)
     expected[point] = camera.project(pose, index.xyz[point])
-    rows = rows[camera.inside(expected[index.point[rows]], reach)]
+    seen[point] = camera.inside(expected[point], reach)
+    rows = rows[seen[index.point[rows]]]
     if not len(rows) or not len(query.points):
         return np.zeros((0, 2), np.int64), np.zeros(0)
     first, second, far = pairs_near(

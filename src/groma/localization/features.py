@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from groma._numba import loop
 from groma._rows import Rows, column
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import together
@@ -51,6 +52,19 @@ class FeatureGates:
 FEATURES = FeatureGates()
 
 
+# ---------------------------------------------------------------------------------------------------------- Kernels
+@loop
+def _sum(descriptor, owner, total):
+    for n in range(len(owner)):
+        square = np.float32(0.0)
+        for j in range(descriptor.shape[1]):
+            square += np.float32(descriptor[n, j]) ** 2
+        factor = np.float32(1.0) / np.sqrt(max(square, np.float32(1e-6)))
+        for j in range(descriptor.shape[1]):
+            total[owner[n], j] += factor * descriptor[n, j]
+
+
+# ----------------------------------------------------------------------------------------------------------- Public
 @dataclass(frozen=True, eq=False)
 class DescribedPoints(Rows):
     """Points of an image."""
@@ -122,6 +136,13 @@ def unit(descriptors: Bytes) -> npt.NDArray[np.float32]:
     """Descriptors (n, 128) as vectors of length one."""
     values = descriptors.astype(np.float32)
     return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), np.float32(1e-6))
+
+
+def summed(descriptors: Bytes, owner: IntArray, count: int) -> npt.NDArray[np.float32]:
+    """Sums (count, 128) of the descriptors of each owner, each of length one."""
+    total = np.zeros((count, 128), np.float32)
+    _sum(descriptors, owner, total)
+    return total
 
 
 def find_features(

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from groma._numba import loop
 from groma._typing import BoolArray, IntArray
 from groma.gates import gate
-from groma.localization.features import DescribedPoints, unit
+from groma.localization.features import DescribedPoints, summed, unit
 from groma.localization.map_index import MapIndex
 from groma.localization.matching import Vectors, match_descriptors
 
@@ -26,7 +25,9 @@ class LandmarkGates:
 
     points: int = gate(600, "points", "of a query, the coarsest", "cost: of matching")
     corners: int = gate(200, "points", "of its corners, the strongest", "cost: of matching")
-    landmarks: int = gate(10_000, "points", "of the map at most, those that two images see first", "cost: of matching")
+    landmarks: int = gate(
+        6, "points", "of the map at most for each of these, those that two images see first", "cost: of matching"
+    )
     dimensions: int = gate(48, "directions", "of descriptors", "derived from their energy: 97 to 98 %")
     sample: int = gate(20_000, "descriptors", "that the directions are computed from", "cost: 10 ms")
 
@@ -34,20 +35,6 @@ class LandmarkGates:
 GATES = LandmarkGates()
 
 
-# ---------------------------------------------------------------------------------------------------------- Kernels
-@loop
-def _sum(descriptor, point, total):
-    """Sums of the descriptors of each point, each of length one."""
-    for n in range(len(point)):
-        square = np.float32(0.0)
-        for j in range(descriptor.shape[1]):
-            square += np.float32(descriptor[n, j]) ** 2
-        factor = np.float32(1.0) / np.sqrt(max(square, np.float32(1e-6)))
-        for j in range(descriptor.shape[1]):
-            total[point[n], j] += factor * descriptor[n, j]
-
-
-# ----------------------------------------------------------------------------------------------------------- Public
 @dataclass(frozen=True, eq=False)
 class DescribedLandmarks:
     """Points of a map, one descriptor each."""
@@ -61,19 +48,18 @@ class DescribedLandmarks:
     @staticmethod
     def of(index: MapIndex, upright: BoolArray, gates: LandmarkGates = GATES) -> DescribedLandmarks:
         """Average the descriptors of an index; ``upright`` (P,) are the points that were described so."""
-        total = np.zeros((len(index.xyz), 128), np.float32)
-        _sum(index.descriptor, index.point, total)
+        total = summed(index.descriptor, index.point, len(index.xyz))
         step = max(len(index.descriptor) // gates.sample, 1)
         some = unit(index.descriptor[::step])
         directions = np.ascontiguousarray(np.linalg.eigh(some.T @ some)[1][:, -gates.dimensions :])
         return DescribedLandmarks(directions, _short(total, directions), upright)
 
     def match(self, points: DescribedPoints, landmarks: IntArray) -> IntArray:
-        """Pairs (n, 2) of points of a query and of some points of the map that are alike."""
+        """Pairs (n, 2) of points of a query and of some points of the map, of each kind the first, that are alike."""
         found: list[IntArray] = [np.zeros((0, 2), np.int64)]
-        for upright in (False, True):
+        for upright, count in ((False, GATES.points), (True, GATES.corners)):
             rows = np.flatnonzero(points.upright == upright)
-            own = landmarks[self.upright[landmarks] == upright]
+            own = np.sort(landmarks[self.upright[landmarks] == upright][: GATES.landmarks * count])
             short = _short(unit(points.descriptors[rows]), self.directions)
             pairs = match_descriptors(short, self.descriptor[own])
             found.append(np.column_stack([rows[pairs[:, 0]], own[pairs[:, 1]]]))
@@ -87,19 +73,18 @@ def coarsest(points: DescribedPoints) -> IntArray:
     return np.concatenate([blobs[order[: GATES.points]], corners[: GATES.corners]])
 
 
-def seen_in(index: MapIndex, images: IntArray, gates: LandmarkGates = GATES) -> IntArray:
-    """Return the points of a map that some images see, at most so many.
-
-    What two of them see is seen again more often, and more often from near the images that come first.
+def seen_in(index: MapIndex, images: IntArray) -> IntArray:
+    """Return the points of a map that some images see, those first that are seen again more often: what two of them
+    see, and what the images that come first see.
     """
-    times, first = np.zeros((2, len(index.xyz)), np.int64)
-    for rank, image in enumerate(images.tolist()):
-        seen = np.zeros(len(index.xyz), bool)
-        seen[index.point[index.begin[image] : index.begin[image + 1]]] = True
-        first[seen & (times == 0)] = rank
-        times += seen
-    point = np.flatnonzero(times)
-    return np.sort(point[np.lexsort((first[point], times[point] < 2))[: gates.landmarks]])
+    count = len(images)
+    first, again = np.full((2, len(index.xyz)), count, np.uint16)
+    for rank, image in reversed(list(enumerate(images.tolist()))):
+        seen = index.point[index.begin[image] : index.begin[image + 1]]
+        again[seen] = np.where(first[seen] < count, 0, count)
+        first[seen] = rank
+    point = np.flatnonzero(first < count)
+    return point[np.argsort((first + again)[point], kind="stable")]
 
 
 def counted_in(index: MapIndex, images: IntArray, points: IntArray) -> IntArray:

@@ -243,24 +243,26 @@ class Localizer:
     ) -> _Found:
         """The pose from matches of a part of a query, those that it guides to, and what mirrored points match."""
         near = nearest_images(self.index, images, found.points[:, 1], self.options.gates.near)
-        last = [found]
+        matches = found.matches(part, self.scene, self.index)
+        last, used = [found], [matches]
 
         def guided(best: Refined) -> Matches:
             reach = self._reach(query, best)
             last[0] = found_near(
                 query, self.scene, self.index, near, best.camera, best.pose, (reach, reach), self.options.lines
             )
-            return last[0].matches(query, self.scene, self.index)
+            used[0] = last[0].matches(query, self.scene, self.index)
+            return used[0]
 
         def closest(best: Refined, other: Refined) -> tuple[int, int]:
             return closest_of(last[0].distance[best.point_inliers], mirror.distances(other, self._reach(query, best)))
 
         def expected(best: Refined) -> tuple[tuple[float, float], float]:
-            seen, agreeing = last[0].matches(query, self.scene, self.index), last[0].points[best.point_inliers, 1]
+            agreeing = last[0].points[best.point_inliers, 1]
             limit = self._alike_limits[self._landmarks.upright[agreeing].astype(np.int64)]
             alike = agreeing[last[0].distance[best.point_inliers] <= limit]
             around = nearest_images(self.index, images, agreeing, self.options.gates.near)
-            return shown_of(self.scene, self.index, self._again, around, best, seen, alike, self.options.lines)
+            return shown_of(self.scene, self.index, self._again, around, best, used[0], alike, self.options.lines)
 
         def common(best: Refined) -> FloatArray:
             if self._common is None:
@@ -268,7 +270,6 @@ class Localizer:
             landmarks = last[0].points[:, 1], last[0].lines[:, 1]
             return self._common.of_query(best, landmarks, self._own_camera(best.camera))
 
-        matches = found.matches(part, self.scene, self.index)
         mirror = MirrorImage(
             query, part, camera, self.scene, self.index, lambda points: matched(points, self._alike(points)),
             self.options.gates.near,

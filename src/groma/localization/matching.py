@@ -25,7 +25,7 @@ class MatchGates:
 MATCHES = MatchGates()
 #: Rows and columns that are compared at a time: their products stay in the cache (cost: the result does not depend on
 #: it).
-_ROWS, _COLUMNS = 128, 2048
+_ROWS, _COLUMNS = 512, 512
 Vectors = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
 
@@ -89,6 +89,7 @@ def _near(
     cell_begin,
     cell_point,
     cells,
+    side,
     reach,
     pixels,
     second,
@@ -105,7 +106,7 @@ def _near(
     count = 0
     for i in range(expected.shape[0]):
         u, v, own = expected[i, 0], expected[i, 1], rows_of_first[i]
-        column, row = int(np.floor(u / reach)) + 1, int(np.floor(v / reach)) + 1
+        column, row = int(np.floor(u / side)) + 1, int(np.floor(v / side)) + 1
         for y in range(max(row - 1, 0), min(row + 2, cells[1])):
             for x in range(max(column - 1, 0), min(column + 2, cells[0])):
                 for at in range(cell_begin[y * cells[0] + x], cell_begin[y * cells[0] + x + 1]):
@@ -191,9 +192,9 @@ def pairs_near(
     (k,) int, (k,) int, (k,) float
         Rows of both, and the distances of the descriptors as vectors of length one.
     """
-    low = pixels.min(axis=0)
+    low, side = pixels.min(axis=0), 2.0 * reach
     here, there = expected - low, np.ascontiguousarray(pixels - low)
-    cell = np.floor(there / reach).astype(np.int64) + 1
+    cell = np.floor(there / side).astype(np.int64) + 1
     cells = cell.max(axis=0) + 2
     number = cell[:, 1] * cells[0] + cell[:, 0]
     order = np.argsort(number, kind="stable")
@@ -202,7 +203,7 @@ def pairs_near(
     while True:
         rows, columns, far = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room)
         count = _near(
-            np.ascontiguousarray(here), rows_of_first, *first, begin, order, cells, reach, there, second,
+            np.ascontiguousarray(here), rows_of_first, *first, begin, order, cells, side, reach, there, second,
             lengths_of(second), least, rows, columns, far,
         )  # fmt: skip
         if count <= room:

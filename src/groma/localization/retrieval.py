@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from groma._typing import FloatArray
 from groma.features.images import to_gray
-from groma.localization.features import Bytes, find_points, unit
+from groma.localization.features import Bytes, find_points, summed, unit
 
 #: Words of a vocabulary, and descriptors that it is made from at most (cost: time of making and comparing).
 WORDS, _SAMPLE = 32, 20_000
@@ -38,13 +38,11 @@ class VladRetrieval:
 
     def gather(self, descriptors: Bytes) -> npt.NDArray[np.float32]:
         """Description (K * 128,) of an image with these descriptors of points."""
-        values, words = unit(descriptors), self.vocabulary
-        total = np.zeros_like(words)
-        if len(values) and len(words):
-            nearest = (values @ words.T - 0.5 * (words**2).sum(axis=1)).argmax(axis=1)
-            order = np.argsort(nearest, kind="stable")
-            used, begin, count = np.unique(nearest[order], return_index=True, return_counts=True)
-            total[used] = np.add.reduceat(values[order], begin) - count[:, None].astype(np.float32) * words[used]
+        words, total = self.vocabulary, np.zeros_like(self.vocabulary)
+        if len(descriptors) and len(words):
+            nearest = (unit(descriptors) @ words.T - 0.5 * (words**2).sum(axis=1)).argmax(axis=1)
+            count = np.bincount(nearest, minlength=len(words)).astype(np.float32)
+            total = summed(descriptors, nearest, len(words)) - count[:, None] * words
         total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), np.float32(1e-9))
         return total.ravel() / np.float32(max(np.linalg.norm(total), 1e-9))
 
