@@ -13,8 +13,8 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import FloatArray, IntArray
 
-#: Height of the bands into which features are sorted, pixels (cost: number of comparisons).
-BAND = 16.0
+#: Width of the cells into which features are sorted, pixels (cost: number of comparisons).
+CELL = 16.0
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
 
@@ -29,37 +29,31 @@ def _count_bits(x):
 
 
 @loop
-def _best_near(expected, first, pixel, second, order, begin, band, radius, max_bits, partner, bits, distance):
+def _best_near(expected, first, pixel, second, order, begin, columns, cell, radius, max_bits, partner, bits, distance):
     """Write the best partner of each of both sides, or -1, with its bits and squared distance.
 
-    The rows of ``pixel`` and ``second`` are sorted into bands of the image, each in order of u; band k begins at
-    ``begin[k]``. ``order`` has their numbers, which ``partner`` is about; of rows that are as good the least counts.
-    ``partner``, ``bits`` and ``distance`` hold first, then second.
+    The rows of ``pixel`` and ``second`` are sorted into the cells of a grid with so many ``columns``; those of cell k
+    begin at ``begin[k]``. ``order`` has their numbers, which ``partner`` is about; of rows that are as good the least
+    counts. ``partner``, ``bits`` and ``distance`` hold first, then second.
     """
-    count, words, bands = expected.shape[0], first.shape[1], begin.shape[0] - 1
+    count, rows = expected.shape[0], (begin.shape[0] - 1) // columns
     for i in range(count):
         u, v = expected[i, 0], expected[i, 1]
-        if not (v + radius >= 0.0 and v - radius < bands * band and abs(u) < np.inf):
+        if not (v + radius >= 0.0 and v - radius < rows * cell and u + radius >= 0.0 and u - radius < columns * cell):
             continue
-        for k in range(max(int((v - radius) / band), 0), min(int((v + radius) / band) + 1, bands)):
-            low, high = begin[k], begin[k + 1]
-            while low < high:
-                middle = (low + high) // 2
-                if pixel[middle, 0] < u - radius:
-                    low = middle + 1
-                else:
-                    high = middle
-            for j in range(low, begin[k + 1]):
-                if pixel[j, 0] > u + radius:
-                    break
+        a, b, c, d = first[i, 0], first[i, 1], first[i, 2], first[i, 3]
+        left, right = max(int((u - radius) / cell), 0), min(int((u + radius) / cell) + 1, columns)
+        for k in range(max(int((v - radius) / cell), 0), min(int((v + radius) / cell) + 1, rows)):
+            for j in range(begin[k * columns + left], begin[k * columns + right]):
                 apart = (pixel[j, 0] - u) ** 2 + (pixel[j, 1] - v) ** 2
                 if apart > radius * radius:
                     continue
-                differ = np.int64(0)
-                for word in range(words):
-                    differ += _count_bits(first[i, word] ^ second[j, word])
-                    if differ > max_bits:
-                        break
+                differ = (
+                    _count_bits(second[j, 0] ^ a)
+                    + _count_bits(second[j, 1] ^ b)
+                    + _count_bits(second[j, 2] ^ c)
+                    + _count_bits(second[j, 3] ^ d)
+                )
                 if differ > max_bits:
                     continue
                 number = order[j]
@@ -127,22 +121,25 @@ def pair_anywhere(first: np.ndarray, second: np.ndarray, max_bits: int) -> tuple
 
 @dataclass(frozen=True)
 class PlacedFeatures:
-    """Described features of an image, sorted by their places: in bands, and from left to right in each."""
+    """Described features of an image, sorted into the cells of a grid, row by row."""
 
-    #: (m, 2) pixels, (m, 4) words of descriptors, (m,) their numbers, (bands + 1,) starts of the bands.
+    #: (m, 2) pixels, (m, 4) words of descriptors, (m,) their numbers, (cells + 1,) starts of the cells, and the number
+    #: of cells in a row.
     pixel: FloatArray
     words: np.ndarray
     number: IntArray
     begin: IntArray
+    columns: int
 
     @classmethod
     def of(cls, pixel: FloatArray, descriptor: np.ndarray) -> PlacedFeatures:
         """Sort features: pixels (m, 2), not negative, and descriptors (m, 32) uint8."""
-        band = (pixel[:, 1] / BAND).astype(np.int64)
-        order = np.lexsort((pixel[:, 0], band))
-        begin = np.searchsorted(band[order], np.arange(band.max(initial=-1) + 2))
-        words = np.ascontiguousarray(descriptor[order]).view(np.uint64)
-        return cls(np.ascontiguousarray(pixel[order]), words, order, begin)
+        column, row = (pixel / CELL).astype(np.int64).T
+        columns = int(column.max(initial=0)) + 1
+        cell = row * columns + column
+        order = np.argsort(cell, kind="stable")
+        begin = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=(row.max(initial=-1) + 1) * columns))])
+        return cls(pixel[order], descriptor[order].view(np.uint64), order, begin, columns)
 
 
 def pair_near(
@@ -172,7 +169,8 @@ def pair_near(
     partner, bits, distance = np.full(n + m, -1), np.zeros(n + m, np.int64), np.zeros(n + m)
     _best_near(
         np.ascontiguousarray(expected), np.ascontiguousarray(descriptor).view(np.uint64), features.pixel,
-        features.words, features.number, features.begin, BAND, float(radius), int(max_bits), partner, bits, distance,
+        features.words, features.number, features.begin, features.columns, CELL, float(radius), int(max_bits),
+        partner, bits, distance,
     )  # fmt: skip
     rows = np.flatnonzero(partner[:n] >= 0)
     rows = rows[partner[n + partner[rows]] == rows]
