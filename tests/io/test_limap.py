@@ -13,7 +13,7 @@ from _models import rig_scene
 
 from groma.cli.main import run
 from groma.errors import FileFormatError, OutputError
-from groma.io import read_scene, structures_of, write_colmap
+from groma.io import read_scene, structures_of, write_archive, write_colmap
 from groma.io.limap.files import LINE_2D, MEMBER_2D, MEMBER_3D, NONE
 from groma.io.limap.structures import (
     Group2d,
@@ -327,3 +327,15 @@ def test_structures_of_what_has_none(tmp_path):
     (tmp_path / "scene.npz").write_bytes(b"")
     assert structures_of(tmp_path / "model") is None and structures_of(tmp_path / "scene.npz") is None
     assert structures_of(DATA / "binary") is not None
+
+
+def test_results_are_read_with_what_a_colmap_model_cannot_hold(tmp_path):
+    scene = holistic(4, seed=1).start
+    write_colmap(scene.keep(lines=[]), tmp_path / "out")
+    write_archive(scene, tmp_path / "out" / "scene.npz")
+    assert read_scene(tmp_path / "out").num_lines == 0  # an archive of that name beside a model of someone else
+    (tmp_path / "out" / "summary.json").write_text("{}")
+    assert equal(scene, read_scene(tmp_path / "out")) and structures_of(tmp_path / "out") is None
+    (tmp_path / "submap_2").mkdir()
+    write_archive(scene, tmp_path / "submap_2" / "scene.npz")
+    assert equal(scene, read_scene(tmp_path / "submap_2"))

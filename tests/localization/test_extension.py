@@ -24,7 +24,6 @@ from groma.localization.calibration import CalibrationChoice
 from groma.localization.extension import _with_new_lenses, extended_model, in_world_of
 from groma.localization.joining.merging import _line_sigma, _one_to_one, _same_lines, merged_model
 from groma.localization.localizer import Localizer
-from groma.localization.map_images import read_map
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.posed_model import gather_photographs
 from groma.mapping.result import MapResult
@@ -327,11 +326,3 @@ def test_a_folder_with_other_files_is_not_replaced(tmp_path):
     (tmp_path / "out.images" / "mine.jpg").write_bytes(b"1")
     with pytest.raises(OutputError, match="no links"):
         photograph_folder(tmp_path / "out", force=True)
-
-
-def test_a_map_is_read_with_what_was_measured(truth, tmp_path):
-    """A COLMAP model in the same folder has no place for it."""
-    write_scene(near_the_middle(truth), tmp_path / "map", format="colmap")
-    assert not len(read_map(tmp_path / "map").principal_point_priors)
-    write_scene(near_the_middle(truth), tmp_path / "map" / "scene.npz")
-    assert len(read_map(tmp_path / "map").principal_point_priors) == 1

@@ -26,6 +26,7 @@ from groma.bounded.arrays import ArrayMembers, Header, opened_arrays
 from groma.bounded.text import shown
 from groma.errors import FileFormatError
 from groma.io.atomic import atomic_output
+from groma.io.colmap.files import is_model
 from groma.io.reading import existing, reading
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Distances, Scene
@@ -37,6 +38,15 @@ _KIND = "groma archive"
 #: Tables that archives held before all distances were in one: of what their distances are.
 _OF_DISTANCES = {"camera_distances": Kind.IMAGE, "point_distances": Kind.CONTROL_POINT}
 _COLUMNS_OF_DISTANCES = ("first_idx", "second_idx", "distance", "sigma")
+
+
+def archive_in(folder: Path) -> Path | None:
+    """Return ``scene.npz`` of a result of groma, which holds more than the COLMAP model there; None of other folders.
+
+    In a folder with a model, ``summary.json`` tells that it is one.
+    """
+    archive = folder / "scene.npz"
+    return archive if archive.is_file() and ((folder / "summary.json").is_file() or not is_model(folder)) else None
 
 
 def write_archive(scene: Scene, path: str | os.PathLike[str], force: bool = False) -> None:
@@ -159,14 +169,16 @@ def _read_array(members: ArrayMembers, name: str, shape: tuple[int | None, ...])
 register_format(
     SceneFormat(
         "archive",
-        source="a groma archive (.npz)",
+        source="a groma archive (.npz), or a result with scene.npz in it",
         target=".npz for an archive",
         endings=(".npz",),
-        # zip files, and damaged ones by name
+        # zip files, damaged ones by name, and results
         recognise=lambda place, head: (
-            head[:4] in (b"PK\x03\x04", b"PK\x05\x06") or (place.suffix.lower() == ".npz" and place.is_file())
+            head[:4] in (b"PK\x03\x04", b"PK\x05\x06")
+            or (place.suffix.lower() == ".npz" and place.is_file())
+            or archive_in(place) is not None
         ),
-        read=read_archive,
+        read=lambda place: read_archive(archive_in(place) or place),
         write=write_archive,
     )
 )

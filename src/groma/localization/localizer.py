@@ -17,6 +17,7 @@ from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
 from groma.features.images import GrayImage, to_gray
 from groma.gates import gate
+from groma.io import read_scene
 from groma.localization.candidates import (
     Candidates,
     MirrorImage,
@@ -29,7 +30,7 @@ from groma.localization.candidates import (
 from groma.localization.expected import FoundAgain, nearest_images, shown_of
 from groma.localization.features import DescribedImage, DescribedPoints, find_features
 from groma.localization.landmarks import DescribedLandmarks, coarsest, seen_in
-from groma.localization.map_images import OPTIONS, estimated_in_summary, image_paths, images_in_summary, read_map
+from groma.localization.map_images import OPTIONS, estimated_in_summary, image_paths, images_in_summary
 from groma.localization.map_index import images_told, kept_index
 from groma.localization.pose.absolute_pose import (
     UNKNOWN_LENS,
@@ -127,7 +128,7 @@ class Localizer:
     ) -> None:
         say = logged_stages("localization", progress)
         self.options = options or LocalizeOptions()
-        self.scene = map_ if isinstance(map_, Scene) else read_map(map_)
+        self.scene = map_ if isinstance(map_, Scene) else read_scene(map_)
         check_map(self.scene)
         if index is None and not isinstance(map_, Scene):
             index = index_file(Path(map_))
@@ -318,7 +319,7 @@ def photographs_of(map_: str | os.PathLike[str], images: str | os.PathLike[str] 
     try:
         return _folder(map_, images, index_file(Path(map_)))
     except InputError:
-        read_map(map_)  # what is no map at all tells nothing of photographs, either
+        read_scene(map_)  # what is no map at all tells nothing of photographs, either
         raise
 
 

@@ -4,14 +4,12 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections import defaultdict
 from pathlib import Path
 
 from groma.bounded.documents import read_document
 from groma.bounded.names import IMAGES, stays_inside
 from groma.errors import GromaError, InputError
-from groma.io import read_scene
 from groma.scene import Scene
 
 #: How the folder of a map's photographs is passed.
@@ -58,12 +56,6 @@ def images_in_summary(map_: Path) -> Path | None:
         return Path(told) if isinstance(told, str) and Path(told).is_dir() else None
     except (OSError, ValueError, AttributeError, GromaError):
         return None
-
-
-def read_map(place: str | os.PathLike[str]) -> Scene:
-    """Return the scene of a map: of OUT ``scene.npz``, as a COLMAP model has no place for what was measured."""
-    whole = Path(place) / "scene.npz"
-    return read_scene(whole if whole.is_file() else place)
 
 
 def estimated_in_summary(map_: Path) -> tuple[bool, bool]:

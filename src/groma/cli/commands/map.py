@@ -277,13 +277,13 @@ def _start(
     console: Console, images: Path, model: Path | None, poses: Path | None, options: "MapOptions"
 ) -> "tuple[Scene | None, MapOptions]":
     """Return the initial scene, None if there are only photographs, and the options adapted to its calibration."""
-    from groma.localization.map_images import read_map
+    from groma.io import read_scene
     from groma.mapping.posed.given import scene_at_poses
 
     if model is None:
         options.point_model()  # refuses a wrong name now
     if poses is None:
-        return (None if model is None else read_map(model)), options
+        return (None if model is None else read_scene(model)), options
     given = scene_at_poses(images, poses, options.point_model())
     for sentence in given.sentences:
         console.say(sentence)

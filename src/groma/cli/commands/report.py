@@ -35,7 +35,7 @@ def report(
     For the folder of a finished map the page also shows convergence and the rejection reasons of segments.
     """
     from groma.cli.shared import output as _output
-    from groma.cli.shared.input import check_inputs, whole_scene
+    from groma.cli.shared.input import check_inputs
 
     _output.check_outputs(force, output, json_target=console.json_target, file=True)
     check_inputs(source, images, before, covariance)
@@ -50,7 +50,7 @@ def report(
 
     if images is not None and not images.is_dir():
         raise InputError(f"{images} is not a folder of images. Check --images.")
-    scene = read_scene(whole_scene(source))
+    scene = read_scene(source)
     earlier = read_scene(before) if before is not None else None
     if images is not None and scene.num_images and not any(image_file(images, name) for name in scene.images.names):
         console.warn(f"{images} holds none of the images of the scene, such as {scene.images.names[0]!r}.")

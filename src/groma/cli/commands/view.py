@@ -37,7 +37,7 @@ def view(
     import contextlib
 
     from groma.cli.shared import output as _output
-    from groma.cli.shared.input import check_inputs, refuse_idle, whole_scene
+    from groma.cli.shared.input import check_inputs, refuse_idle
 
     _output.check_json(console.json_target, force)
 
@@ -52,7 +52,7 @@ def view(
     from groma.viz.pictures import folder_of_images
     from groma.viz.viewer.scene import serving, wait_for_interrupt
 
-    scene = read_scene(whole_scene(source))
+    scene = read_scene(source)
     console.say(sentence_of(scene))
     if images is None and (images := folder_of_images(source, scene.images.names)) is not None:
         console.say(f"Photographs: {images}")

@@ -6,12 +6,6 @@ from pathlib import Path
 from groma.errors import InputError
 
 
-def whole_scene(source: Path) -> Path:
-    """Return the archive in the folder of a map or track, which holds more than the model there; else the source."""
-    archive = source / "scene.npz"
-    return archive if archive.is_file() and (source / "summary.json").is_file() else source
-
-
 def refuse_idle(*options: tuple[str, bool, str]) -> None:
     """Refuse options without effect: (option, whether it has none, what it needs)."""
     for option, in_vain, others in options:

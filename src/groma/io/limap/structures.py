@@ -43,7 +43,7 @@ import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import FileFormatError, InputError
-from groma.io.archive import read_archive, write_archive
+from groma.io.archive import archive_in, read_archive, write_archive
 from groma.io.atomic import atomic_output
 from groma.io.colmap.files import find_model, is_model
 from groma.io.limap.files import (
@@ -103,14 +103,16 @@ def structures_of(source: str | os.PathLike[str]) -> Structures | None:
     Parameters
     ----------
     source : path
-        What :func:`groma.io.read_scene` read: the folder of a model, or the folder it lies in. Nothing else has them.
+        What :func:`groma.io.read_scene` read: the folder of a model, or the folder it lies in. Nothing else has them;
+        of a result with ``scene.npz``, which is read in its place, they are made anew.
 
     Raises
     ------
     FileFormatError
         If the structures are damaged.
     """
-    if not Path(source).is_dir() or not is_model(Path(source)):
+    place = Path(source)
+    if not place.is_dir() or not is_model(place) or archive_in(place) is not None:
         return None
     folder = find_model(source)[0] / "structures"
     return read_limap(folder) if folder.is_dir() and _form(folder) is not None else None
