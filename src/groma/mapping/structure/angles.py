@@ -49,6 +49,8 @@ _KINDS = (
 )
 #: Components of known directions that are the same.
 _SAME = 1e-6
+#: Pairs that are tried together, and columns that are taken off a covariance at once (cost: memory, time).
+_TOGETHER, _LATE = 4096, 64
 #: A unit vector and its covariance.
 Vector = tuple[FloatArray, FloatArray]
 
@@ -186,34 +188,57 @@ def _consistent(
 ) -> BoolArray:
     """Which pairs (M,) agree with those that agree before them; vectors have their deviations in their covariances.
 
-    The state is a turn of each vector along two axes across it, with a joint covariance, as in a Kalman filter.
+    The state is a turn of each vector along two axes across it, as in a Kalman filter, with the covariance ``joint``
+    minus ``late @ late.T``, which is taken off now and then. Pairs that follow from those before stay so, so all up to
+    the next one that changes the state are tried together.
     """
-    axes = np.stack(perpendicular(vectors), axis=1)
-    size, one = 2 * len(vectors), gates.held**2
-    turn, joint = np.zeros(size), np.zeros((len(vectors), 2, len(vectors), 2))
+    axes, size, one = np.stack(perpendicular(vectors), axis=1), 2 * len(vectors), gates.held**2
+    turn, joint = np.zeros((len(vectors), 2)), np.zeros((len(vectors), 2, len(vectors), 2))
     joint[np.arange(len(vectors)), :, np.arange(len(vectors))] = axes @ covariance @ np.swapaxes(axes, 1, 2)
-    joint, agree = joint.reshape(size, size), np.zeros(len(pairs), bool)
-    limit = [chi_square_gate(gates.refused / max(len(pairs), 1), freedom) for freedom in (2, 1)]
-    for k, (i, j) in enumerate(pairs.tolist()):
-        place = np.array([2 * i, 2 * i + 1, 2 * j, 2 * j + 1])
-        u, v = vectors[i] + turn[place[:2]] @ axes[i], vectors[j] + turn[place[2:]] @ axes[j]
-        u, v = u / np.linalg.norm(u), v / np.linalg.norm(v)
-        across = v[None] if right[k] else np.stack(perpendicular(u))
-        off = across @ (u if right[k] else v)
-        slope = np.hstack([across @ axes[i].T, (u[None] if right[k] else across) @ axes[j].T])
-        if not right[k]:
-            slope[:, :2] *= -np.sign(u @ v)
-        known = slope @ joint[np.ix_(place, place)] @ slope.T
-        agree[k] = np.trace(known) < one  # follows from those before
-        if agree[k]:
-            continue
-        known += one * np.eye(len(off))
-        agree[k] = off @ np.linalg.solve(known, off) < limit[int(right[k])]
-        if agree[k]:
-            moved = joint[:, place] @ slope.T
-            gain = np.linalg.solve(known, moved.T).T
-            turn, joint = turn - gain @ off, joint - gain @ moved.T
+    joint, late, used = joint.reshape(size, size), np.zeros((size, _LATE)), 0
+    limit = np.array([chi_square_gate(gates.refused / max(len(pairs), 1), freedom) for freedom in (2, 1)])
+    places = (2 * pairs[:, :, None] + np.arange(2)).reshape(-1, 4)
+    agree, start, tried = np.zeros(len(pairs), bool), 0, 1
+    while start < len(pairs):
+        rows = slice(start, start + min(tried, _TOGETHER))
+        place = places[rows]
+        off, slope = _deviation(vectors, axes, turn, pairs[rows], right[rows])
+        shared = slope @ late[place, :used]
+        known = slope @ joint[place[:, :, None], place[:, None]] @ np.swapaxes(slope, 1, 2)
+        known -= shared @ np.swapaxes(shared, 1, 2)
+        follows = np.trace(known, axis1=1, axis2=2) < one
+        solved = np.linalg.solve(known + one * np.eye(2), off[:, :, None])[:, :, 0]
+        agrees = (off * solved).sum(axis=1) < limit[right[rows].astype(int)]
+        changes = np.flatnonzero(~follows & agrees)
+        agree[rows] = follows
+        start, tried = start + len(follows), 2 * tried
+        if len(changes):
+            k = changes[0]
+            start, tried = rows.start + k + 1, max(k, 1)
+            agree[start - 1], agree[start:] = True, False
+            moved = joint[:, place[k]] @ slope[k].T - late[:, :used] @ shared[k].T
+            turn -= (moved @ solved[k]).reshape(turn.shape)
+            late[:, used : used + 2] = np.linalg.solve(np.linalg.cholesky(known[k] + one * np.eye(2)), moved.T).T
+            used += 1 if right[start - 1] else 2
+            if used > _LATE - 2:
+                joint, used = joint - late[:, :used] @ late[:, :used].T, 0
     return agree
+
+
+def _deviation(
+    vectors: FloatArray, axes: FloatArray, turn: FloatArray, pairs: IntArray, right: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Deviations of pairs (M, 2) from their relation, the second of right angles zero; derivatives (M, 2, 4)."""
+    ends = [vectors[end] + np.einsum("mk,mki->mi", turn[end], axes[end]) for end in pairs.T]
+    u, v = (end / np.linalg.norm(end, axis=1)[:, None] for end in ends)
+    across = np.stack(perpendicular(u), axis=1)
+    across[right] = np.stack([v[right], np.zeros_like(v[right])], axis=1)
+    other = across.copy()
+    other[right, 0] = u[right]
+    sign = np.where(right, 1.0, -np.sign(np.einsum("mi,mi->m", u, v)))
+    first, second = (np.swapaxes(axes[end], 1, 2) for end in pairs.T)
+    slope = np.concatenate([sign[:, None, None] * (across @ first), other @ second], axis=2)
+    return np.einsum("mki,mi->mk", across, np.where(right[:, None], u, v)), slope
 
 
 def _worth(pairs: IntArray, family: IntArray, num: int) -> FloatArray:
