@@ -89,6 +89,8 @@ WALLS: dict[str, Surface] = {
     "flat": wall(2000),
     "rough": wall(2000, rough=0.003),
     "rougher": wall(2000, rough=0.006),
+    "as rough as stone": wall(2000, rough=0.01),
+    "as rough as rubble": wall(2000, rough=0.022),
     "panels": wall(2000, steps=0.003),
     "bent by 0.01": wall(2000, bend=0.01),
     "bent by 0.03": wall(2000, bend=0.03),

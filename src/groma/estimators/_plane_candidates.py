@@ -8,7 +8,7 @@ stands alone or is part of a larger one.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -32,12 +32,15 @@ _JUDGES = 64
 _SCORED_AT_ONCE, _PIECES = 256, 32
 
 
+#: Where the entries of a covariance, and those of its diagonal, are among the packed ones.
+_UNPACKED, _DIAGONAL = [0, 1, 2, 1, 3, 4, 2, 4, 5], [0, 3, 5]
+
+
 @dataclass(frozen=True)
 class Features:
     """Points and segment ends, near ones together."""
 
     places: FloatArray
-    covariances: FloatArray
     #: (N, 6) covariances as vectors whose product with :func:`squares` of a normal is the variance along it.
     packed: FloatArray
     #: (N,) distance at which a feature has its neighbours.
@@ -53,11 +56,22 @@ class Features:
     #: (N,) the number that each was given with, and where each of those is here.
     given: IntArray
     position: IntArray
+    #: Whether surfaces deviate, which neighbours do alike.
+    rough: bool = False
 
     @property
     def arrays(self) -> tuple[Any, ...]:
         """What loops take."""
         return self.places, self.packed, self.spacing, self.partner, self.carrier, self.neighbours, self.balls
+
+    def thicker(self, factor: float) -> Features:
+        """Return features of rough surfaces: the least standard deviation of each is so many times as large."""
+        least = np.linalg.eigvalsh(self.packed[:, _UNPACKED].reshape(-1, 3, 3))[:, 0]
+        packed = self.packed.copy()
+        packed[:, _DIAGONAL] += (factor**2 - 1.0) * least[:, None]
+        balls = self.balls.copy()
+        balls[:, 4] = np.maximum.reduceat(packed[:, _DIAGONAL].sum(axis=1), np.arange(0, len(packed), BALL))
+        return replace(self, packed=packed, balls=balls, rough=True)
 
 
 def features_of(places: FloatArray, noise: FloatArray, partner: IntArray, carrier: IntArray) -> Features:
@@ -76,7 +90,6 @@ def features_of(places: FloatArray, noise: FloatArray, partner: IntArray, carrie
     variance = np.maximum.reduceat(np.trace(noise, axis1=1, axis2=2), first)
     return Features(
         places=places,
-        covariances=noise,
         packed=np.ascontiguousarray(noise[:, *np.triu_indices(3)]),
         spacing=np.maximum(distance[:, min(PLANE_SEARCH.rank, near - 1)], 1e-12),
         partner=position[partner[given]],
@@ -146,11 +159,13 @@ def _through_neighbours(places, packed, neighbours, seed, choice, limit, rounds,
         planes[h, 3] = -(n[0] * c0 + n[1] * c1 + n[2] * c2)
 
 
-def from_neighbours(features: Features, gate: float, rng: np.random.Generator) -> tuple[FloatArray, IntArray]:
-    """Candidates (H, 4) from a feature and two of its neighbours, improved on the neighbourhood; their homes (H,)."""
-    number, near = features.neighbours.shape
+def from_neighbours(
+    features: Features, free: IntArray, gate: float, rng: np.random.Generator
+) -> tuple[FloatArray, IntArray]:
+    """Candidates (H, 4) from a free feature and two neighbours, improved on the neighbourhood; their homes (H,)."""
+    number, near = len(free), features.neighbours.shape[1]
     count = max(number // PLANE_SEARCH.features_per_seed, min(PLANE_SEARCH.min_seeds, PLANE_SEARCH.repeated * number))
-    seed = features.position[rng.permutation(np.repeat(np.arange(number), -(-count // number)))[:count]]
+    seed = free[rng.permutation(np.repeat(np.arange(number), -(-count // number)))[:count]]
     choice = rng.integers(1, near, (count, 2))
     planes = np.empty((count, 4))
     _through_neighbours(
@@ -161,12 +176,11 @@ def from_neighbours(features: Features, gate: float, rng: np.random.Generator) -
     return planes[valid], seed[valid]
 
 
-def from_segments(features: Features, num_points: int, gate: float) -> tuple[FloatArray, IntArray, int]:
+def from_segments(features: Features, corner: IntArray, gate: float) -> tuple[FloatArray, IntArray, int]:
     """Candidates (H, 4) from near segments that are coplanar within their noise, their homes, and how many were tried.
 
-    Of the pairs of a segment, those that fix their plane best.
+    Of the pairs of a segment, those that fix their plane best. ``corner`` (L, 2) has the ends of the segments.
     """
-    corner = features.position[num_points:].reshape(-1, 2)
     ends = features.places[corner]
     if len(ends) < 2:
         return np.zeros((0, 4)), np.zeros(0, np.int64), 0

@@ -67,10 +67,11 @@ def tilt_loop(places, packed, rows, plane, center, precision):
 def _refined_loop(features, labels, gates, mark, room, numbers, plane):
     """Refine a plane on the part of what lies on it that is connected; ``room[2]`` begins with the first such part.
 
+    The normal of features that deviate alike is known as by one.
     Returns how many features that part has in the end, and the half thickness of the layer: 0 if it is no plane.
     """
     places, packed, spacing, partner, carrier, neighbours, balls = features
-    gate, wider, far, link, converged, band, min_support, max_tilt, rank, steps, rounds = gates
+    gate, wider, far, link, converged, band, min_support, max_tilt, alike, rank, steps, rounds = gates
     height, spread, moved, weight, precision = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
     before, center = np.empty(4), np.empty(3)
     num_free = num_near = 0
@@ -104,6 +105,7 @@ def _refined_loop(features, labels, gates, mark, room, numbers, plane):
         if step > 1 and largest < converged * usual:
             break
     tilt = tilt_loop(places, packed, room[2, :count], plane, center, precision)
+    tilt *= count if alike else 1
     return count, band * median(spread[:count]) if tilt <= max_tilt**2 else 0.0
 
 
@@ -200,7 +202,7 @@ class Grower:
         self._joined, self._numbers = np.empty(count, bool), np.empty((5, count))
         self._refining = (
             gate, GATES.wider, GATES.far, GATES.link, GATES.converged, GATES.band, options.min_support,
-            options.max_tilt, GATES.rank, GATES.grow_steps, GATES.fit_rounds,
+            options.max_tilt, features.rough, GATES.rank, GATES.grow_steps, GATES.fit_rounds,
         )  # fmt: skip
         least = GATES.hopeless * options.min_share
         self._polishing = GATES.link, GATES.inlier, least, ROUNDS, GATES.polish_steps, GATES.fit_rounds
@@ -220,8 +222,12 @@ class Grower:
         rows, layer = self._room[2, :count].copy(), self._room[3, :inner]
         if inner == 0 or share < options.min_share:
             return None, plane, rows
-        alarm = self._log10_false_alarms(plane, rows)
-        if max(alarm, self._log10_even(inner, band)) > np.log10(options.max_false_alarms):
+        alarm, even = self._log10_false_alarms(plane, rows), self._log10_even(inner, band)
+        if features.rough:  # some thicker layer stands out by chance
+            even += self._log_tried
+        if max(alarm, even) > np.log10(options.max_false_alarms):
+            return None, plane, rows
+        if features.rough and np.mean(labels[layer[self._on(inner)]] < 0) <= GATES.own:
             return None, plane, rows
         precision, weight = self._numbers[2, :inner], self._numbers[3, :inner]
         fit = fit_with_covariance(plane, center, features.places[layer], precision, weight)
@@ -247,6 +253,10 @@ class Grower:
             self._mark,
         )
         return log10_binomial_tail(inside - 4, number - 3, chance / max(number, 1)) + self._log_tried  # three fix it
+
+    def _on(self, inner: int) -> BoolArray:
+        """Which of the last layer lie on the plane."""
+        return np.abs(self._numbers[0, :inner]) < math.sqrt(self._gate) * self._numbers[1, :inner]
 
     def _log10_even(self, inner: int, band: float) -> float:
         """How likely so much of the last layer lies on the plane if it is filled as its fuller side is, log10.

@@ -33,6 +33,13 @@ _SURVEYED = "chosen on Strecha's scenes and synthetic buildings"
 class PlaneSearchGates:
     """How planes are searched in points and segments: candidates, their growth, their layer, and the end."""
 
+    thicker: float = gate(
+        4.0, "1", "by which the noise of features grows where rough walls are searched",
+        "derived from the layer: planes four times as rough as the noise stand out in it",
+    )  # fmt: skip
+    own: float = gate(
+        0.5, "share", "of what lies on a rough plane that lies on none found before", "convention: more than half"
+    )
     neighbours: int = gate(32, "features", "neighbours that make a candidate, and that improve it", _SURVEYED)
     rank: int = gate(8, "features", "the neighbour whose distance is the spacing", _SURVEYED)
     features_per_seed: int = gate(

@@ -12,6 +12,11 @@ points have their neighbours there anyway. It is kept if
   filled as the fuller side of the layer is. Relief without a flat part has no plane, nor has a thin post one that cuts
   through its sides, nor a round body one that touches it.
 
+What is left is searched again as rough walls, by features with four times the noise. As neighbours deviate alike on
+these, their number does not make the normal better known: the noise is at most ``max_tilt`` of the spread of the plane
+across its longest axis. Among so many thicker layers some stand out against their sides by chance, so that this test
+counts all that were tried, and most of what lies on such a plane must be on none of those found before.
+
 A segment takes part with its two end points; points on it count no more once it is there.
 
 Everything is local: the number of candidates grows with the features, and each is scored, grown and judged where it was
@@ -29,7 +34,7 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
-from groma.estimators._plane_candidates import Scores, features_of, from_neighbours, from_segments
+from groma.estimators._plane_candidates import Features, Scores, features_of, from_neighbours, from_segments
 from groma.estimators._plane_growth import Grower, Grown, connected_to
 from groma.estimators._plane_options import PLANE_SEARCH, PlaneOptions
 from groma.gates import chi_square_gate
@@ -157,25 +162,42 @@ def _extract(
     options: PlaneOptions,
     progress: Callable[[int, int], None],
 ) -> list[Grown]:
-    """Find planes one by one; ``filled`` gets their numbers."""
+    """Find planes, then rough ones; ``filled`` gets their numbers."""
+    features, labels = features_of(places, noise, partner, carrier), np.full(len(places), -1)
+    found: list[Grown] = []
+    for one in (features, features.thicker(PLANE_SEARCH.thicker)):
+        if np.count_nonzero(labels < 0) >= options.min_support:
+            _extract_of(one, num_points, labels, found, options, progress)
+    filled[features.given] = labels
+    return found
+
+
+def _extract_of(
+    features: Features,
+    num_points: int,
+    labels: IntArray,
+    found: list[Grown],
+    options: PlaneOptions,
+    progress: Callable[[int, int], None],
+) -> None:
+    """Find planes one by one, beside those ``found``; ``labels`` and ``found`` are added to."""
     rng = np.random.default_rng(options.seed)
-    features = features_of(places, noise, partner, carrier)
-    labels = np.full(len(places), -1)
     gate = chi_square_gate(1.0 - options.level, 1)
-    first, first_homes = from_neighbours(features, gate, rng)
-    second, second_homes, num_pairs = from_segments(features, num_points, gate)
+    free = features.position[labels[features.position] < 0]
+    corner = features.position[num_points:].reshape(-1, 2)
+    first, first_homes = from_neighbours(features, free, gate, rng)
+    second, second_homes, num_pairs = from_segments(features, corner[(labels[corner] < 0).all(axis=1)], gate)
     candidates, homes = np.concatenate([first, second]), np.concatenate([first_homes, second_homes])
     scores = Scores(features, candidates, homes, gate, PLANE_SEARCH.link)
     support, score = scores.of(np.arange(len(candidates)), labels)
-    log_tried = np.log10(PLANE_SEARCH.refined * (len(first) + num_pairs) + 1.0)
-    found: list[Grown] = []
+    log_tried = np.log10(2.0 * PLANE_SEARCH.refined * (len(first) + num_pairs) + 1.0)  # two thicknesses
     # With less information than the test of false alarms needs, a candidate will be rejected.
     least_score = np.log(10.0) * (log_tried - np.log10(options.max_false_alarms))
     alive = (support >= 0.5 * options.min_support) & (score >= least_score)
     queue = [(-float(score[k]), int(k)) for k in np.flatnonzero(alive)]
     heapify(queue)
     grower = Grower(features, gate, float(log_tried), options)
-    failures, scored = 0, np.zeros(len(candidates), np.int64)
+    failures, scored = 0, np.full(len(candidates), len(found))
     patience = max(PLANE_SEARCH.patience, len(candidates) // PLANE_SEARCH.candidates_per_failure)
     while queue and failures < patience:
         _, best = heappop(queue)
@@ -203,8 +225,6 @@ def _extract(
             labels[grown.taken] = len(found)
             found.append(grown)
         scores.keep_others(plane, rows, alive)
-    filled[features.given] = labels
-    return found
 
 
 __all__ = ["BAND", "PlaneOptions", "PlaneSet", "connected_to", "find_planes"]

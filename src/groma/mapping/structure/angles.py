@@ -36,7 +36,7 @@ from groma.estimators.directions import DirectionSet
 from groma.estimators.membership import Candidates, averaged_memberships
 from groma.estimators.plane_search import PlaneSet
 from groma.gates import chi_square_gate, gate
-from groma.geometry.algebra import perpendicular
+from groma.geometry.algebra import perpendicular, unit
 from groma.mapping.structure.relations import Pairs
 from groma.scene import Scene
 from groma.scene.survey import Kind
@@ -79,6 +79,9 @@ class AngleGates:
     refused: float = gate(0.05, "probability", "that a right pair contradicts those kept before it", "convention: 5 %")
 
 
+GATES = AngleGates()
+
+
 @dataclass(frozen=True)
 class Angles:
     """Pairs of unit vectors that are parallel or at right angles."""
@@ -94,20 +97,25 @@ class Angles:
 
 
 def angles_between(
-    planes: PlaneSet, directions: DirectionSet, vertical: Vector | None, level: float
+    planes: PlaneSet,
+    directions: DirectionSet,
+    lines: tuple[Pairs, Pairs],
+    vertical: Vector | None,
+    level: float,
 ) -> dict[str, Pairs]:
     """Find relations between planes and directions, by their names; deviations are radians.
 
-    The vertical, if it is known, has the number after the last direction.
+    ``lines`` are those on planes and those along directions. The vertical, if it is known, has the number after the
+    last direction.
     """
-    vectors = [planes.planes[:, :3], directions.vectors, *([] if vertical is None else [vertical[0][None]])]
-    covariance = [
-        planes.covariance[:, :3, :3],
-        directions.covariance,
-        *([] if vertical is None else [vertical[1][None]]),
-    ]
+    inside = _inside(*lines, len(planes), len(directions))
+    normals, noise = _known_by_directions(planes, directions, inside, level)
+    vectors = [normals, directions.vectors, *([] if vertical is None else [vertical[0][None]])]
+    covariance = [noise, directions.covariance, *([] if vertical is None else [vertical[1][None]])]
     is_direction = np.arange(sum(map(len, vectors))) >= len(planes)
-    found, num = right_angles(np.concatenate(vectors), np.concatenate(covariance), is_direction, level), len(planes)
+    num, implied = len(planes), np.zeros((len(is_direction), len(is_direction)), bool)
+    implied[:num, num : num + len(directions)] = inside
+    found = right_angles(np.concatenate(vectors), np.concatenate(covariance), is_direction, level, implied)
     of_kind, relations = (found.pairs >= num).sum(axis=1), {}
     for number, names in enumerate(_KINDS):
         for right, name in enumerate(names):
@@ -115,6 +123,38 @@ def angles_between(
             pairs = found.pairs[rows] - num * (found.pairs[rows] >= num)
             relations[name] = Pairs(pairs, found.probability[rows], found.sigma[rows])
     return relations
+
+
+def _inside(on: Pairs, along: Pairs, num_planes: int, num_directions: int) -> BoolArray:
+    """(K, D) whether a line on a plane is along a direction, which lies in the plane then."""
+    inside = np.zeros((num_planes, num_directions), bool)
+    direction = np.full(int(max(on.pairs[:, 0].max(initial=0), along.pairs[:, 0].max(initial=0))) + 1, -1)
+    direction[along.pairs[:, 0]] = along.pairs[:, 1]
+    plane, of_line = on.pairs[:, 1], direction[on.pairs[:, 0]]
+    inside[plane[of_line >= 0], of_line[of_line >= 0]] = True
+    return inside
+
+
+def _known_by_directions(
+    planes: PlaneSet, directions: DirectionSet, inside: BoolArray, level: float, gates: AngleGates = GATES
+) -> tuple[FloatArray, FloatArray]:
+    """Normals (K, 3) and covariances (K, 3, 3), the better known ones by the directions that lie in their planes.
+
+    Directions that contradict a plane, by a chi-square test of all of them, tell nothing about it.
+    """
+    normals, covariance = planes.planes[:, :3].copy(), planes.covariance[:, :3, :3].copy()
+    for k in np.flatnonzero(inside.any(axis=1)).tolist():
+        normal, of = normals[k], np.flatnonzero(inside[k])
+        axes, vectors = np.stack(perpendicular(normal)), directions.vectors[of]
+        own, slope, off = axes @ covariance[k] @ axes.T, vectors @ axes.T, vectors @ normal
+        noise = np.diag(np.einsum("i,dij,j->d", normal, directions.covariance[of], normal) + gates.exact**2)
+        total = slope @ own @ slope.T + noise
+        if off @ np.linalg.solve(total, off) > chi_square_gate(1.0 - level, len(of)):
+            continue
+        gain = np.linalg.solve(total, slope @ own).T
+        normals[k] = unit(normal - axes.T @ (gain @ off))
+        covariance[k] = axes.T @ (own - gain @ slope @ own) @ axes
+    return normals, covariance
 
 
 def vertical_of(scene: Scene) -> Vector | None:
@@ -128,7 +168,12 @@ def vertical_of(scene: Scene) -> Vector | None:
 
 
 def right_angles(
-    vectors: FloatArray, covariance: FloatArray, kind: BoolArray, level: float, gates: AngleGates = AngleGates()
+    vectors: FloatArray,
+    covariance: FloatArray,
+    kind: BoolArray,
+    level: float,
+    implied: BoolArray | None = None,
+    gates: AngleGates = GATES,
 ) -> Angles:
     """Find parallel and perpendicular pairs.
 
@@ -142,6 +187,9 @@ def right_angles(
         Vectors of two kinds, planes and directions: pairs of other kinds deviate by other angles.
     level : float
         Level of the chi-square tests.
+    implied : (N, N) bool, optional
+        Pairs, the smaller number first, that are used in the vectors already: they tell nothing of how exact angles
+        are.
     gates : AngleGates
         What is right.
     """
@@ -150,6 +198,7 @@ def right_angles(
         return Angles(found, right, np.zeros(0), np.zeros(0))
     live = np.column_stack([np.ones(len(found)), (~right).astype(np.float64)])
     certain = (variance * live).max(axis=1) < gates.known**2
+    telling = certain if implied is None else certain & ~implied[found[:, 0], found[:, 1]]
     exact = variance + gates.exact**2 * live
     family = 2 * kind[found].sum(axis=1) + right
     even = np.where(right, 0.5 / gates.layer, 1.0 / (np.pi * gates.layer**2))
@@ -160,11 +209,11 @@ def right_angles(
             variance=exact,
             unit=live,
             clutter=0.5 * even + 0.5 * _normal(offset, exact + gates.nearly**2 * live),
-            counted=certain,
+            counted=telling,
             group=family,
         ),
         np.full(6, gates.most),
-        _worth(found[certain], family[certain], len(vectors)),
+        _worth(found[telling], family[telling], len(vectors)),
     )
     squared = (offset**2 / (exact + (told.deviation[family, None] * live) ** 2)).sum(axis=1)
     passed = certain & (squared < np.where(right, *(chi_square_gate(1.0 - level, freedom) for freedom in (1, 2))))
@@ -177,7 +226,7 @@ def right_angles(
     per_vector = max(len(kept) / max(np.count_nonzero(times), 1), 1.0)
     deviation, axes = np.zeros(6), live > 0.0
     for k in np.unique(family[kept]):
-        rows = kept[family[kept] == k]
+        rows = kept[(family[kept] == k) & telling[kept]]
         deviation[k] = _upper_end(offset[rows][axes[rows]] ** 2, variance[rows][axes[rows]], per_vector, gates)
     sigma = deviation[family[kept]] * np.sqrt(np.maximum(0.25 * times[found[kept]].sum(axis=1), 1.0))
     return Angles(found[kept], right[kept], told.probability[kept], sigma)

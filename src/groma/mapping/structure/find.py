@@ -167,7 +167,7 @@ def detect_structure(
     found["line_along_direction"] = along
     found["point_on_line"] = on_line if options.points_on_lines else Pairs.none()
     vertical = vertical_of(scene)
-    found |= angles_between(planes, directions, vertical, level)
+    found |= angles_between(planes, directions, (found["line_on_plane"], along), vertical, level)
     return Structure(
         scene=_with_vertical(scene, vertical, directions, found).replace(
             planes=Planes(np.arange(len(planes)) + 1, planes.planes), relations=_relations(found, marks, options)
