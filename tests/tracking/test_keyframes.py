@@ -13,8 +13,7 @@ from groma.tracking.frame.features import describe
 from groma.tracking.map.landmarks import ALIVE
 from groma.tracking.map.points import PointTracks
 from groma.tracking.map.track_map import TrackMap
-from groma.tracking.pose.estimate import PoseEstimate
-from groma.tracking.pose.verification import PoseVerification
+from groma.tracking.pose.verification import PoseVerification, misses_much
 from groma.tracking.stopwatch import Stopwatch
 
 OPTIONS = TrackOptions(num_points=250, num_features=500)
@@ -111,12 +110,9 @@ def test_a_pose_that_most_points_do_not_agree_with_is_in_doubt():
     pixel = np.random.default_rng(2).uniform(20, 220, (40, 2))
     track_map.points.xyz[rows] = 2.0 * camera.bearings(pixel)
     track_map.points.state[rows] = ALIVE
-    before, verification = PointTracks(rows, pixel), PoseVerification(camera, OPTIONS)
-    none = np.zeros(0, bool)
+    before = PointTracks(rows, pixel)
     for agree, doubt in ((15, True), (25, False)):
-        estimate = PoseEstimate(se3.identity(), np.arange(40) < agree, none, none, np.eye(6), ())
-        assert verification.misses_much(track_map, before, estimate) is doubt
+        assert misses_much(track_map, camera, before, se3.identity(), agree, OPTIONS.gates) is doubt
     # Points that leave the view are not missed.
     away = se3.exp(np.array([[0, 0, 0, 0, 1.2, 0.0]]))[0]
-    estimate = PoseEstimate(away, np.arange(40) < 1, none, none, np.eye(6), ())
-    assert not verification.misses_much(track_map, before, estimate)
+    assert not misses_much(track_map, camera, before, away, 1, OPTIONS.gates)
