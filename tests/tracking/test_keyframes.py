@@ -9,10 +9,12 @@ from groma.geometry import se3
 from groma.tracking import Tracker, TrackOptions
 from groma.tracking.backend.mapper import Mapper
 from groma.tracking.frame.camera import TrackCamera
-from groma.tracking.frame.features import describe
+from groma.tracking.frame.features import Features, describe
+from groma.tracking.frame.measurements import Measurements
+from groma.tracking.map.culling import drop_unseen
 from groma.tracking.map.landmarks import ALIVE
-from groma.tracking.map.points import PointTracks
-from groma.tracking.map.track_map import TrackMap
+from groma.tracking.map.points import PointTracks, find_again
+from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.pose.verification import PoseVerification, misses_much
 from groma.tracking.stopwatch import Stopwatch
 
@@ -102,6 +104,31 @@ def test_features_are_described_in_all_parts_of_an_image():
         np.histogram(features.pixel[right, k], 4, limits)[0] for k, limits in ((0, (120, 320)), (1, (0, 240)))
     )
     assert columns.min() > 0 and rows.min() > 0
+
+
+def test_points_that_are_not_found_are_looked_for_ever_more_rarely(monkeypatch):
+    camera, track_map, gates = TrackCamera.of(_room.camera()), TrackMap(), OPTIONS.gates.points
+    rows = track_map.points.extend(3)
+    pixel = np.array([[60.0, 60.0], [120.0, 80.0], [200.0, 90.0]])
+    track_map.points.xyz[rows], track_map.points.state[rows] = 2.0 * camera.bearings(pixel), ALIVE
+    track_map.points.keyframe[rows], track_map.points.pixel[rows] = 0, pixel
+    image, pose = np.zeros((camera.height, camera.width), np.uint8), se3.identity()
+    track_map.keyframes.append(Keyframe(0, 0.0, "0", pose, image, Measurements.empty(), Features.none(), np.zeros(0)))
+    asked = []
+
+    def follow(_before, _now, _pixels, guesses, levels):
+        """Only the first is ever found."""
+        asked.append(len(guesses))
+        return guesses, guesses[:, 0] < 100
+
+    monkeypatch.setattr("groma.tracking.map.points.follow", follow)
+    for _ in range(gates.max_misses + 1):
+        found = find_again(track_map, camera, image, pose, PointTracks.empty(), 10, gates)
+        assert found.index.tolist() == [0]
+    assert asked == [3, 3, 1, 3, 1, 1, 1, 3, 1, 1, 1, 1, 1]
+    assert track_map.points.misses.tolist() == [0, 13, 13]
+    drop_unseen(track_map, gates.max_misses)
+    assert track_map.points.alive.tolist() == [True, False, False]
 
 
 def test_a_pose_that_most_points_do_not_agree_with_is_in_doubt():
