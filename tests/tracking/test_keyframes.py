@@ -9,12 +9,13 @@ from groma.geometry import se3
 from groma.tracking import Tracker, TrackOptions
 from groma.tracking.backend.mapper import Mapper
 from groma.tracking.frame.camera import TrackCamera
-from groma.tracking.frame.features import describe
+from groma.tracking.frame.features import Features, describe
+from groma.tracking.frame.measurements import Measurements
+from groma.tracking.map.culling import drop_unseen
 from groma.tracking.map.landmarks import ALIVE
-from groma.tracking.map.points import PointTracks
-from groma.tracking.map.track_map import TrackMap
-from groma.tracking.pose.estimate import PoseEstimate
-from groma.tracking.pose.verification import PoseVerification
+from groma.tracking.map.points import PointTracks, find_again
+from groma.tracking.map.track_map import Keyframe, TrackMap
+from groma.tracking.pose.verification import PoseVerification, misses_much
 from groma.tracking.stopwatch import Stopwatch
 
 OPTIONS = TrackOptions(num_points=250, num_features=500)
@@ -105,18 +106,40 @@ def test_features_are_described_in_all_parts_of_an_image():
     assert columns.min() > 0 and rows.min() > 0
 
 
+def test_points_that_are_not_found_are_looked_for_ever_more_rarely(monkeypatch):
+    camera, track_map, gates = TrackCamera.of(_room.camera()), TrackMap(), OPTIONS.gates.points
+    rows = track_map.points.extend(3)
+    pixel = np.array([[60.0, 60.0], [120.0, 80.0], [200.0, 90.0]])
+    track_map.points.xyz[rows], track_map.points.state[rows] = 2.0 * camera.bearings(pixel), ALIVE
+    track_map.points.keyframe[rows], track_map.points.pixel[rows] = 0, pixel
+    image, pose = np.zeros((camera.height, camera.width), np.uint8), se3.identity()
+    track_map.keyframes.append(Keyframe(0, 0.0, "0", pose, image, Measurements.empty(), Features.none(), np.zeros(0)))
+    asked = []
+
+    def follow(_before, _now, _pixels, guesses, levels):
+        """Only the first is ever found."""
+        asked.append(len(guesses))
+        return guesses, guesses[:, 0] < 100
+
+    monkeypatch.setattr("groma.tracking.map.points.follow", follow)
+    for _ in range(gates.max_misses + 1):
+        found = find_again(track_map, camera, image, pose, PointTracks.empty(), 10, gates)
+        assert found.index.tolist() == [0]
+    assert asked == [3, 3, 1, 3, 1, 1, 1, 3, 1, 1, 1, 1, 1]
+    assert track_map.points.misses.tolist() == [0, 13, 13]
+    drop_unseen(track_map, gates.max_misses)
+    assert track_map.points.alive.tolist() == [True, False, False]
+
+
 def test_a_pose_that_most_points_do_not_agree_with_is_in_doubt():
     camera, track_map = TrackCamera.of(_room.camera()), TrackMap()
     rows = track_map.points.extend(40)
     pixel = np.random.default_rng(2).uniform(20, 220, (40, 2))
     track_map.points.xyz[rows] = 2.0 * camera.bearings(pixel)
     track_map.points.state[rows] = ALIVE
-    before, verification = PointTracks(rows, pixel), PoseVerification(camera, OPTIONS)
-    none = np.zeros(0, bool)
+    before = PointTracks(rows, pixel)
     for agree, doubt in ((15, True), (25, False)):
-        estimate = PoseEstimate(se3.identity(), np.arange(40) < agree, none, none, np.eye(6), ())
-        assert verification.misses_much(track_map, before, estimate) is doubt
+        assert misses_much(track_map, camera, before, se3.identity(), agree, OPTIONS.gates) is doubt
     # Points that leave the view are not missed.
     away = se3.exp(np.array([[0, 0, 0, 0, 1.2, 0.0]]))[0]
-    estimate = PoseEstimate(away, np.arange(40) < 1, none, none, np.eye(6), ())
-    assert not verification.misses_much(track_map, before, estimate)
+    assert not misses_much(track_map, camera, before, away, 1, OPTIONS.gates)

@@ -54,7 +54,7 @@ from groma.tracking.pose.following import Attempt, find_lines_again, find_points
 from groma.tracking.pose.initialise import Initialiser
 from groma.tracking.pose.prediction import MotionModel
 from groma.tracking.pose.relocalise import Found, promote
-from groma.tracking.pose.verification import PoseVerification
+from groma.tracking.pose.verification import PoseVerification, misses_much
 from groma.tracking.result import about_rest, map_to_scene
 from groma.tracking.stopwatch import Stopwatch
 
@@ -218,15 +218,15 @@ class Tracker:
             predicted, prior_sigma = self._with_turn(data, predicted, prior_sigma)
         estimate, followed = follow_frame(
             self.map, present.data, data, present.followed, present.pose, predicted, prior_sigma, watch,
-            self._mapper.frame_pool,
+            self._mapper.frame_pool, self._searched,
         )  # fmt: skip
         if estimate is None:
             return Attempt(predicted, prior_sigma, followed=followed)
         trusted = self._verification.trusts(self.map, data, estimate)
-        doubt = self._verification.is_surprised(estimate, predicted, prior_sigma)
-        if not trusted or doubt or self._verification.misses_much(self.map, present.followed.points, estimate):
-            return Attempt(predicted, prior_sigma, None, estimate, trusted, followed)
-        return Attempt(predicted, prior_sigma, estimate, None, trusted, followed)
+        doubt = not trusted or self._verification.is_surprised(estimate, predicted, prior_sigma) or misses_much(
+            self.map, self.camera, present.followed.points, estimate.pose, estimate.counts["points"], self.options.gates
+        )  # fmt: skip
+        return Attempt(predicted, prior_sigma, *(None, estimate) if doubt else (estimate, None), trusted, followed)
 
     def _search(self, data: FrameFeatures, attempt: Attempt, watch: Stopwatch) -> tuple[Attempt, Found | None]:
         """Relocalise a frame that could not be tracked by described features, or keep its doubtful pose."""

@@ -65,6 +65,7 @@ def propose(
     seed: int,
     share: float = 0.0,
     least: int = 0,
+    min_trials: int = HYPOTHESES.min_trials,
 ) -> FloatArray | None:
     """Return the pose (7,) cam_from_world that most matches agree with; None without one.
 
@@ -80,6 +81,8 @@ def propose(
         A pose that a smaller share of the matches agrees with is of no interest, and need not be found.
     least
         Nor is one that fewer matches agree with.
+    min_trials
+        Samples drawn at least, however many matches agree with the first of them.
     """
     import poselib
 
@@ -88,8 +91,8 @@ def propose(
         return None
     settings = {
         "max_reproj_error": errors[0], "max_epipolar_error": errors[1], "seed": seed,
-        "success_prob": HYPOTHESES.confidence, "min_iterations": HYPOTHESES.min_trials,
-        "max_iterations": _trials(share),
+        "success_prob": HYPOTHESES.confidence, "min_iterations": min_trials,
+        "max_iterations": _trials(share, min_trials),
     }  # fmt: skip
     ends, lines = matches.segments2d, matches.segments3d
     if matches.num_lines:
@@ -109,11 +112,11 @@ def propose(
     return np.concatenate([rotation / np.linalg.norm(rotation), shift])
 
 
-def _trials(share: float) -> int:
+def _trials(share: float, min_trials: int) -> int:
     """How many samples of three hold one without outliers, if so many matches are none; three times as many, since
     noise spoils some.
     """
     if share <= 0.0:
         return HYPOTHESES.max_trials
     wanted = 3.0 * np.log1p(-HYPOTHESES.confidence) / np.log1p(-(min(share, 0.99) ** 3))
-    return int(np.clip(wanted, HYPOTHESES.min_trials, HYPOTHESES.max_trials))
+    return int(np.clip(wanted, min_trials, HYPOTHESES.max_trials))

@@ -45,7 +45,7 @@ class PointGates:
     again_room: float = gate(0.2, "share", "share of the wanted points that must be missing", "cost: time per frame")
     min_parallax: float = gate(0.015, "rad", "angle between rays that place a point", SEQUENCES)
     max_error: float = gate(2.5, "px", "distance of a placed point from its pixels", SEQUENCES)
-    max_misses: int = gate(12, "frames", "a point looked for so often in a row and not found is dropped", SEQUENCES)
+    max_misses: int = gate(12, "frames", "a point not found in so many frames in a row is dropped", SEQUENCES)
 
 
 @dataclass(frozen=True)

@@ -131,7 +131,7 @@ def _add_points(
     features = data.features
     _place_pending(track_map, camera, data, pose, tracks)
     if len(tracks):
-        points.keyframe[tracks.index], points.pixel[tracks.index] = index, tracks.pixel
+        points.keyframe[tracks.index], points.pixel[tracks.index], points.misses[tracks.index] = index, tracks.pixel, 0
     if options.points:
         # Described features near tracked points belong to them.
         if len(features.pixel) and len(tracks):

@@ -72,7 +72,10 @@ def find_again(
     limit: int,
     gates: PointGates,
 ) -> PointTracks:
-    """Look for points of the map that are in view but not followed, by their patches in keyframes."""
+    """Look for points of the map that are in view but not followed, by their patches in keyframes.
+
+    What is not found is hardly found in the next frame: it is looked for again after 1, 2, 4, ... frames in view.
+    """
     points = track_map.points
     wanted = points.alive.copy()
     wanted[tracks.index] = False
@@ -94,6 +97,10 @@ def find_again(
         of = np.flatnonzero(points.keyframe[rows] == index)[:limit]
         if not len(of):
             break
+        misses = points.misses[rows[of]]
+        due = misses & (misses + 1) == 0
+        points.misses[rows[of[~due]]] += 1
+        of = of[due]
         patch = track_map.keyframes[index].gray
         assert patch is not None
         there, good = follow(patch, now, points.pixel[rows[of]], pixel[of], levels=1)

@@ -22,6 +22,7 @@ from groma.tracking.map.points import PointTracks, find_again, follow_points
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.pose.estimate import PoseEstimate, estimate_pose
 from groma.tracking.pose.relocalise import match_planes
+from groma.tracking.pose.verification import misses_much
 
 
 @dataclass(frozen=True)
@@ -47,15 +48,18 @@ def follow_frame(
     prior_sigma: FloatArray,
     watch,
     pool: Executor | None = None,
+    searched: bool = False,
 ) -> tuple[PoseEstimate | None, Followed]:
     """Return the pose of a frame that follows another, and what is still followed.
 
-    Lines and planes are found beside points in a pool.
+    Lines and planes are found beside points in a pool. Where so few points are left that features will be asked
+    anyway, lines are not followed; they do not begin before points if the frame before was ``searched``.
     """
     camera, options, gates = data.camera, data.options, data.options.gates
     tracks, segments = followed.points, followed.lines
     with_lines = options.lines and len(segments.index) > 0
-    lines_followed = beside(pool if with_lines else None, partial(follow_lines, track_map, before, data, segments))
+    at_once = pool if with_lines and not searched else None
+    lines_followed = beside(at_once, partial(follow_lines, track_map, before, data, segments))
     planes_found = beside(pool if data.frame.depth is not None else None, lambda: data.planes)
     with watch("points"):
         tracks = tracks.take(track_map.points.state[tracks.index] != DEAD)
@@ -75,7 +79,9 @@ def follow_frame(
             planes = match_planes(track_map, data, predicted, gates.planes.wide_angle, gates.planes.wide_distance)
     with watch("lines"):
         lines = LineMeasurements.empty()
-        if with_lines:
+        if options.points and misses_much(track_map, camera, followed.points, predicted, len(measured), gates):
+            segments = FollowedSegments.empty()
+        elif with_lines:
             segments = lines_followed()
             lines = measure_lines(track_map, data, segments, few_points=len(measured) < gates.lines.few_points)
     if len(measured) + 2 * len(lines) + 3 * len(planes) < gates.verification.min_followed:

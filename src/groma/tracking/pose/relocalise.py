@@ -104,7 +104,8 @@ def pose_from_matches(
     every, none = np.ones(len(pixel), dtype=bool), np.zeros(0, dtype=bool)
     straight = Straight(camera.pinhole, Matches(pixel, places), every, none)
     # A pose that fewer agree with is of no interest; it need not be looked for as long.
-    pose = propose(straight, (max_error, max_error), 0, min_inliers / max(len(pixel), 1))
+    share = min_inliers / max(len(pixel), 1)
+    pose = propose(straight, (max_error, max_error), 0, share, min_trials=DEFAULT.finding.min_trials)
     if pose is None:
         return None
     away = np.linalg.norm(camera.project(into(pose, places)) - pixel, axis=1)

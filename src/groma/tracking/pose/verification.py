@@ -18,6 +18,7 @@ from groma._typing import FloatArray, IntArray
 from groma.tracking.frame.camera import TrackCamera, apart, into
 from groma.tracking.frame.descriptor_pairs import PlacedFeatures
 from groma.tracking.frame.features import FrameFeatures
+from groma.tracking.gates import TrackingGates
 from groma.tracking.map.points import PointTracks
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.options import TrackOptions
@@ -76,16 +77,6 @@ class PoseVerification:
         """Whether a pose that is trusted is far from the prediction, and much that was followed does not agree."""
         far = not self.is_near(estimate.pose, predicted, prior_sigma, self.gates.surprise)
         return far and _share(estimate) < self.gates.most
-
-    def misses_much(self, track_map: TrackMap, before: PointTracks, estimate: PoseEstimate) -> bool:
-        """Whether most points of the frame before, of those in view of a pose, do not agree with it.
-
-        Points that are followed over a wide step slide along what repeats itself, and then agree on a wrong pose.
-        """
-        index = before.index[track_map.points.alive[before.index]]
-        expected = self.camera.project(into(estimate.pose, track_map.points.xyz[index]))
-        in_view = self.camera.inside(expected, self.options.gates.points.border).sum()
-        return bool(estimate.counts["points"] < self.gates.min_seen * in_view)
 
     def confirms(self, track_map: TrackMap, data: FrameFeatures, estimate: PoseEstimate) -> bool:
         """Whether depth confirms the pose of a frame that was followed with few points and lines."""
@@ -210,6 +201,18 @@ class PoseVerification:
         if self._denied(data, best) or (alone and not self._stands_out(track_map, data, best)):
             return None
         return best
+
+
+def misses_much(
+    track_map: TrackMap, camera: TrackCamera, before: PointTracks, pose: FloatArray, count: int, gates: TrackingGates
+) -> bool:
+    """Whether most points of the frame before, of those in view of a pose, are not among ``count`` points there.
+
+    Points that are followed over a wide step slide along what repeats itself, and then agree on a wrong pose.
+    """
+    index = before.index[track_map.points.alive[before.index]]
+    expected = camera.project(into(pose, track_map.points.xyz[index]))
+    return bool(count < gates.verification.min_seen * camera.inside(expected, gates.points.border).sum())
 
 
 def _share(estimate: PoseEstimate) -> float:
