@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Poses that are known roughly, beside relations between landmarks, which are lengths and would shrink the scene."""
+"""Poses, positions and distances that are known roughly, beside relations between landmarks, which are lengths and
+would shrink the scene.
+"""
 
 import numpy as np
 import pytest
@@ -7,8 +9,11 @@ import pytest
 import groma
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
+from groma.adjustment.survey.place import settled
+from groma.adjustment.survey.reliability import reliability
 from groma.evaluation import evaluate_poses
 from groma.scene.measurements import PosePriors
+from groma.scene.survey import CameraPositions, Distances, Kind, KnownDirections, diagonal_covariance
 from groma.scene.synthetic import holistic
 
 
@@ -31,3 +36,43 @@ def test_relations_do_not_shrink_a_scene_of_rough_poses():
 def test_exact_poses_determine_the_scale_themselves():
     for sigma, count in ((5.0, 1), (1e-4, None)):
         assert assemble(_at_poses(sigma)[1], AssemblyOptions()).num_measurements.get("held scale") == count
+
+
+def _at_positions(sigma):
+    """A scene with planes and measured positions of its cameras, at the truth."""
+    truth = holistic(8, 3, noise_px=0.5).truth
+    covariance = diagonal_covariance(np.full((truth.num_images, 3), sigma))
+    return truth.replace(
+        camera_positions=CameraPositions(np.arange(truth.num_images), truth.cam_centers_in_world, covariance)
+    )
+
+
+@pytest.mark.kernels
+def test_relations_do_not_shrink_a_scene_of_rough_positions():
+    """Without the held scale the adjustment shrinks it until it is stopped after 50 steps."""
+    scene = _at_positions(5.0)
+    result = groma.adjust(scene, groma.AdjustOptions(loss="none"))
+    assert result.report.solve.converged and result.report.solve.iterations < 10
+    assert "determine the scale to 35 %" in " ".join(result.report.warnings)
+    assert "held scale" not in result.report.num_measurements
+    np.testing.assert_allclose(result.scene.cam_centers_in_world, scene.cam_centers_in_world, atol=0.02)
+
+
+@pytest.mark.parametrize(("part", "count"), [(0.1, 1), (1e-4, None)])
+def test_distances_tell_the_scale_as_places_do(part, count):
+    truth = holistic(8, 3, noise_px=0.5).truth
+    apart = float(np.linalg.norm(truth.cam_centers_in_world[1] - truth.cam_centers_in_world[0]))
+    scene = truth.replace(distances=Distances.between(Kind.IMAGE, 0, 1, [apart], [apart * part]))
+    assert assemble(scene, AssemblyOptions()).num_measurements.get("held scale") == count
+    assert assemble(_at_positions(5e3 * part), AssemblyOptions()).num_measurements.get("held scale") == 1
+    assert assemble(_at_positions(1e-4), AssemblyOptions()).num_measurements.get("held scale") is None
+    scaled = settled(scene.transformed(groma.scene.Similarity(1.2), measured=False)).cam_centers_in_world
+    assert np.linalg.norm(scaled[1] - scaled[0]) == pytest.approx(apart, rel=1e-6)
+
+
+@pytest.mark.kernels
+def test_the_held_scale_is_no_measurement_to_test():
+    _, scene = _at_poses(5.0)
+    down = KnownDirections([Kind.IMAGE], [0], [[0.0, 0.0, -1.0]], [[0.0, 1.0, 0.0]], [0.1])
+    found = reliability(scene.replace(known_directions=down))
+    assert found is not None and {one.kind for one in found.measurements} == {"known direction"}

@@ -55,7 +55,9 @@ from groma.solver.solve import solve
 #: Losses by name and scale in pixels; see the page *How to choose* for the measurements behind them.
 ROBUST_STAGES = (("cauchy", 1.0), ("geman_mcclure", 2.0))
 #: Terms that a report counts among the observations, and among the relations; and what was not measured.
-COUNTED_OTHERWISE = ("point observations", "line observations", "relations", "relations in pixels", "principal points")
+COUNTED_OTHERWISE = (
+    "point observations", "line observations", "relations", "relations in pixels", "principal points", "held scale",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -174,7 +176,7 @@ def adjust(
 
 def _settled(scene: Scene, options: AdjustOptions, progress: Callable[[Progress], bool | None] | None) -> AdjustResult:
     """Adjust a scene that is first and last placed where measurements of other instruments fit best."""
-    if not (scene.is_tied and options.refine_poses):
+    if not (scene.has_survey and options.refine_poses):
         return _adjusted(scene, options, progress)
     result = _adjusted(settled(scene), options, progress)
     after = settled(result.scene)

@@ -58,7 +58,7 @@ def settled(scene: Scene) -> Scene:
 
     The scale is kept, too, if depths or stereo pairs determine it; scenes with held objects are left unchanged.
     """
-    if not scene.is_tied or len(scene.held) or not scene.num_images:
+    if not (scene.is_tied or len(scene.distances)) or len(scene.held) or not scene.num_images:
         return scene
     return scene.transformed(_best(scene), measured=False)
 

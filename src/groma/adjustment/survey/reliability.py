@@ -195,6 +195,8 @@ def _entries(
             kind = "control point"
         elif factor.type_name == "pose_prior":  # the pose priors of the scene come first
             kind = "camera pose" if not isinstance(factor.loss, Trivial) else ""
+        elif factor.type_name == "distance" and isinstance(factor.loss, Trivial):  # the held scale
+            kind = ""
         if kind:
             yield kind, next(rows[kind]), factor
 

@@ -5,14 +5,15 @@ On rigs the pose of the rig is compared, the camera being held where it is on it
 :math:`\xi` of the camera's pose is :math:`\mathrm{Ad}(T_{bc})\,\xi` of that of its rig.
 
 **Held scale.** Relations between landmarks are lengths, so a smaller scene fits them better: the sum of squares of N of
-them falls with the square of the scale s. Poses known beforehand, with the information
-:math:`I = \sum |c_i - \bar c|^2 / \sigma_i^2` on the logarithm of the scale, pull it back to about
+them falls with the square of the scale s. Poses, positions, control points and distances that are known pull it back.
+With places :math:`x_i` of the information :math:`W_i` about their weighted mean, they tell of its logarithm
 
-.. math:: s = \frac{I}{I + N} .
+.. math:: I = \sum_i (x_i - \bar x)^\top W_i (x_i - \bar x) + \sum_j (d_j / \sigma_j)^2, \qquad s = \frac{I}{I + N} .
 
 Where that is too far from 1, the distance between two frames is held at what it is at the start, with as much
-information as brings it near 1. Relations then say nothing of the scale, as in a scene without such poses
-(:func:`~groma.adjustment.assemble.first_camera_gauge`).
+information as brings it near 1. Relations then say nothing of the scale, as in a scene without such measurements
+(:func:`~groma.adjustment.assemble.first_camera_gauge`); where others than poses tell it, the whole scene gets it from
+them before and after (:func:`~groma.adjustment.survey.place.settled`).
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from groma._typing import FloatArray
 from groma.adjustment.terms.contract import Draft, Group, Term
 from groma.adjustment.terms.survey_loss import root_information, survey_loss
 from groma.factors.contract import Ref
@@ -30,6 +32,7 @@ from groma.factors.priors.pose_prior import PosePrior
 from groma.factors.priors.position_prior import PositionPrior
 from groma.gates import gate
 from groma.geometry import se3
+from groma.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -83,29 +86,66 @@ def _priors(draft: Draft) -> Iterator[Group]:
 
 
 def _held_scale(draft: Draft) -> Iterator[Group]:
-    scene, options, priors = draft.scene, draft.options, draft.scene.pose_priors
-    if scene.has_scale or not (options.planes and options.refine_poses and options.structure_form == "metric"):
+    scene, options = draft.scene, draft.options
+    told = len(scene.pose_priors) > 0 or scene.has_scale
+    if scene.is_metric or not (told and options.planes and options.refine_poses and options.structure_form == "metric"):
         return
-    centers = se3.inverse(scene.frames.rig_from_world)[:, 4:]
-    away = centers[priors.frame_idx] - centers[priors.frame_idx].mean(axis=0)
-    information = float(np.sum((away / priors.sigma[:, :3]) ** 2))
+    information = _information_on_scale(scene)
     num_lengths = len(scene.relations.point_on_plane) + 2 * len(scene.relations.line_on_plane)
+    centers = se3.inverse(scene.frames.rig_from_world)[:, 4:]
     apart = np.linalg.norm(centers - centers[0], axis=1)
-    if num_lengths > GATES.max_shrinkage * information and apart.max() > 0.0:
-        far = apart.argmax(keepdims=True)
-        yield Group(
-            Distance(
-                first_camera=Ref("frames", np.zeros(1, dtype=np.intp)),
-                second_camera=Ref("frames", far),
-                distances=apart[far],
-                first_arm=np.zeros((1, 3)),
-                second_arm=np.zeros((1, 3)),
-                sqrt_information=np.sqrt(num_lengths / GATES.max_shrinkage) / apart[far],
-            )
+    if num_lengths <= GATES.max_shrinkage * information or apart.max() == 0.0:
+        return
+    if scene.has_scale and information > 0.0:
+        draft.notes.append(
+            f"Measurements determine the scale to {100.0 * information**-0.5:.2g} % (standard deviation). Relations "
+            "with planes would shrink the scene against them: the scale was held in the adjustment, and standard "
+            "deviations of places are without that of the scale."
         )
+    far = apart.argmax(keepdims=True)
+    yield Group(
+        Distance(
+            first_camera=Ref("frames", np.zeros(1, dtype=np.intp)),
+            second_camera=Ref("frames", far),
+            distances=apart[far],
+            first_arm=np.zeros((1, 3)),
+            second_arm=np.zeros((1, 3)),
+            sqrt_information=(num_lengths / GATES.max_shrinkage) ** 0.5 / apart[far],
+        )
+    )
+
+
+def _information_on_scale(scene: Scene) -> float:
+    """Return the information of measurements other than relations on the logarithm of the scale."""
+    frames, table = scene.frames.rig_from_world, scene.pose_priors
+    positions, poses, points = scene.camera_positions, scene.camera_poses, scene.control_points
+    centers, control = scene.cam_centers_in_world, points.is_control
+    priors = np.eye(3) * table.sigma[:, None, :3] ** 2
+    found = [
+        (se3.inverse(frames)[table.frame_idx, 4:], _in_world(priors, frames[table.frame_idx])),
+        (centers[positions.image_idx], positions.covariance),
+        (
+            centers[poses.image_idx],
+            _in_world(poses.covariance[:, :3, :3], scene.cam_from_world[poses.image_idx]),
+        ),
+        (points.xyz[control], points.covariance[control]),
+    ]
+    places, covariances = (np.concatenate(part) for part in zip(*found, strict=True))
+    lengths = float(np.sum((scene.distances.distance / scene.distances.sigma) ** 2))
+    if len(places) == 0:
+        return lengths
+    weights = np.linalg.inv(covariances)
+    mean = np.linalg.solve(weights.sum(axis=0), np.einsum("nij,nj->i", weights, places))
+    return lengths + float(np.einsum("ni,nij,nj->", places - mean, weights, places - mean))
+
+
+def _in_world(covariance: FloatArray, cam_from_world: FloatArray) -> FloatArray:
+    """Return covariances (N, 3, 3) along the axes of cameras along those of the world."""
+    R = se3.to_matrix(cam_from_world)[:, :3, :3]
+    return np.swapaxes(R, 1, 2) @ covariance @ R
 
 
 PRIORS = Term("pose priors", ("pose_priors",), (), _priors)
 POSITIONS = Term("camera positions", ("camera_positions",), (), _positions)
 POSES = Term("camera poses", ("camera_poses",), (), _poses)
-HELD_SCALE = Term("held scale", ("pose_priors", "relations"), (), _held_scale)
+HELD_SCALE = Term("held scale", ("relations",), (), _held_scale)
