@@ -33,6 +33,7 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.gates import gate
+from groma.geometry.algebra import perpendicular
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.hypotheses.known_points import lines_through_points
 from groma.mapping.lines.options import MapLinesOptions
@@ -261,10 +262,8 @@ def angles_about_baseline(ray: FloatArray, baseline: FloatArray) -> FloatArray:
     The angle of a ray about the baseline is the same for all points of an epipolar plane, whichever of the two images
     they are seen in. Intervals start in [-pi, pi) and are at most pi wide.
     """
-    unit = baseline / np.linalg.norm(baseline)
-    u = np.cross(unit, np.eye(3)[np.abs(unit).argmin()])
-    u /= np.linalg.norm(u)
-    angle = np.arctan2(ray @ np.cross(unit, u), ray @ u)
+    first, second = perpendicular(baseline)
+    angle = np.arctan2(ray @ second, ray @ first)
     turn = angle[:, 1] - angle[:, 0]
     turn -= 2 * np.pi * np.floor(turn / (2 * np.pi) + 0.5)
     low = np.where(turn < 0, angle[:, 0] + turn, angle[:, 0])
