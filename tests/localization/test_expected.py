@@ -11,7 +11,7 @@ from groma.geometry import se3
 from groma.localization.expected import FoundAgain, nearest_images, shown_of
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.verdict import Verdict, doubted_if_missing, doubted_if_repeated
-from groma.localization.repeated import Described, unique_points
+from groma.localization.repeated import Described, most_alike, unique_points
 from groma.scene import Cameras
 
 RIGHT = Verdict("localized", 1.0, "all agree.")
@@ -165,11 +165,42 @@ def test_points_are_unique_where_nothing_else_in_the_image_is_described_like_the
     seen = np.clip(np.tile(things[thing], (images, 1)) + rng.normal(0, 3, (150, 128)), 0, 255).astype(np.uint8)
     for upright in (False, True):
         described = Described(np.tile(np.arange(50), images), np.tile(pixels, (images, 1)), seen, np.full(150, upright))
-        unique = unique_points(described, np.arange(0, 200, 50), np.full(images, 640.0), 51)
+        unique = unique_points(*_compared(described, 640.0), 51)
         expected = np.ones(51, bool)
         expected[[*range(10), *range(40, 50)]] = False
         expected[50] = False  # nobody sees it
         assert (unique == expected).mean() > 0.95
         assert not unique[~expected].any()
     # The same thing beside itself is one place.
-    assert unique_points(described, np.arange(0, 200, 50), np.full(images, 32.0 * 600.0), 51)[:50].all()
+    assert unique_points(*_compared(described, 32.0 * 600.0), 51)[:50].all()
+
+
+def test_a_thing_alone_in_its_image_is_not_unique_where_another_image_shows_its_like():
+    """Two things of twenty in each of two images of different places are alike."""
+    rng = np.random.default_rng(6)
+    things = rng.integers(0, 120, (38, 128))
+    thing = np.concatenate([np.arange(20), [0, 1], np.arange(20, 38)])  # of each of 40 points, twenty an image
+    seen = np.clip(np.repeat(things[thing], 2, axis=0) + rng.normal(0, 3, (80, 128)), 0, 255).astype(np.uint8)
+    pixels = np.column_stack([np.tile(np.repeat(np.arange(20) * 30.0, 2), 2), np.full(80, 100.0)])
+    described = Described(np.repeat(np.arange(40), 2), pixels, seen, np.zeros(80, bool))
+    begin, sides = np.array([0, 40, 80]), np.full(2, 640.0)
+
+    def nowhere(image, points):
+        return np.full((len(points), 2), np.nan)
+
+    alone = unique_points(described, begin, sides, np.zeros((2, 0), np.int64), nowhere, 40)
+    together = unique_points(described, begin, sides, np.array([[1], [0]]), nowhere, 40)
+    assert alone.all()
+    np.testing.assert_array_equal(np.flatnonzero(~together), [0, 1, 20, 21])
+
+
+def test_the_most_alike_images_are_others():
+    images = np.eye(4, dtype=np.float32)[[0, 1, 0, 2]]
+    np.testing.assert_array_equal(most_alike(images)[[0, 2], 0], [2, 0])
+    assert most_alike(images[:1]).shape == (1, 0)
+
+
+def _compared(described, side):
+    """What :func:`unique_points` takes of three images of one place, seen at the same pixels."""
+    place = described.pixel[:50]
+    return described, np.arange(0, 200, 50), np.full(3, side), np.array([[1, 2], [0, 2], [0, 1]]), lambda i, p: place[p]

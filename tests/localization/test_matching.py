@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Points, landmarks and lines that match: against the same searches written without any shortcut."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from worlds import CAMERA, make_world, project
@@ -67,9 +65,12 @@ def test_what_is_alike_elsewhere_in_an_image():
     away = np.linalg.norm(vectors[:, None] - vectors[None], axis=2)
     far = np.linalg.norm(pixels[:, None] - pixels[None], axis=2) > 60.0
     expected = np.where(far, away, np.inf).min(axis=1)
-    np.testing.assert_allclose(alike_elsewhere(vectors, pixels, 60.0), expected, atol=1e-3)
+    np.testing.assert_allclose(alike_elsewhere(vectors, pixels, vectors, pixels, 60.0), expected, atol=1e-3)
     assert (expected > np.sort(away, axis=1)[:, 1] + 1e-3).any()
-    assert (alike_elsewhere(vectors[:3], pixels[:3], 1000.0) == 2.0).all()
+    assert (alike_elsewhere(vectors[:3], pixels[:3], vectors[:3], pixels[:3], 1000.0) == 2.0).all()
+    # Where the image would not see the place at all, every other is elsewhere.
+    unseen = np.full((3, 2), np.inf)
+    assert (alike_elsewhere(vectors[:3], unseen, vectors[:3], pixels[:3], 1000.0) < 1e-3).all()
 
 
 def test_lines_near_where_they_are_expected():
@@ -122,8 +123,8 @@ def test_landmarks_are_matched_once_and_by_their_kind():
     found = described.match(points, seen_in(index, np.array([0, 1, 2])))
     assert set(map(tuple, found.tolist())) == {(0, 5), (1, 150), (2, 250), (3, 350), (4, 351)}
     np.testing.assert_array_equal(seen_in(index, np.array([1])), np.arange(100, 300))
-    few = replace(GATES, landmarks=150)  # points 100 to 199 by two of the images, then those of the first image
-    np.testing.assert_array_equal(seen_in(index, np.array([1, 0]), few), np.arange(100, 250))
+    # Points 100 to 199 by two of the images, then those of the first image.
+    np.testing.assert_array_equal(seen_in(index, np.array([1, 0])), np.r_[100:300, 0:100])
     np.testing.assert_array_equal(counted_in(index, np.array([2, 0, 1]), shown), [2, 3, 2])
 
 

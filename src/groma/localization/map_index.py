@@ -36,15 +36,16 @@ from groma.localization.matching import lengths_of
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.records import landmark_covariances, residual_squares
-from groma.localization.repeated import Described, unique_points
+from groma.localization.repeated import Described, most_alike, unique_points
 from groma.localization.retrieval import VladRetrieval
 from groma.localization.triangulation import triangulate_features
 from groma.mapping.lines.neighbors import covisible_neighbors
 from groma.mapping.photographs import read_gray
+from groma.mapping.shown import check_points_shown
 from groma.scene import PointObservations, Points, Scene
 
 #: Of the format of the file; another one is built anew.
-_VERSION = 6
+_VERSION = 7
 #: Images that the features of an image are matched with (cost: time).
 _NEIGHBORS = 12
 
@@ -207,8 +208,9 @@ def build_index(
     Raises
     ------
     InputError
-        If an image of the map cannot be read, or none of its points can be described.
+        If an image of the map cannot be read, or none of its points can be described, or images do not show them.
     """
+    check_points_shown(scene, files)
     work = [(file, *_seen_in(scene, image)) for image, file in enumerate(files)]
     found = map_work(_describe_image, work, partial(say, "describing the images of the map"))
     neighbors = covisible_neighbors(scene, _NEIGHBORS)
@@ -234,8 +236,16 @@ def build_index(
     retrieval = VladRetrieval.learned([one.descriptors for one in features])
     begin, point = np.concatenate([[0], np.cumsum([len(part) for part in points])]), np.concatenate(points)
     described = Described(point, np.concatenate(pixels), np.concatenate(descriptors), point >= len(made.xyz))
+    xyz = np.concatenate([made.xyz, scene.points.xyz])
+    images = np.stack([retrieval.gather(one.descriptors) for one in features])
+
+    def seen_at(image: int, point: IntArray) -> FloatArray:
+        camera = QueryCamera.of(scene.cameras, int(scene.images.camera_idx[image]))
+        return camera.project(scene.cam_from_world[image], xyz[point])
+
+    unique = unique_points(described, begin, _longer_sides(scene), most_alike(images), seen_at, len(xyz))
     index = MapIndex(
-        np.concatenate([made.xyz, scene.points.xyz]),
+        xyz,
         np.concatenate([made.covariance, np.nan_to_num(own_covariance)]),
         begin,
         *described[:3],
@@ -244,8 +254,8 @@ def build_index(
         np.concatenate(rows),
         np.concatenate([one.segment_descriptors for one in found]),
         retrieval.vocabulary,
-        np.stack([retrieval.gather(one.descriptors) for one in features]),
-        unique=unique_points(described, begin, _longer_sides(scene), len(made.xyz) + scene.num_points),
+        images,
+        unique=unique,
     )
     sigma = np.concatenate(sigmas)
     index, difference = _with_common_errors(scene, index, sigma, (own_noise, line_noise), estimated)

@@ -53,10 +53,10 @@ def _compare(alike, row, column, best, top, second):
 
 
 @loop
-def _compare_far(alike, row, column, pixels, square, top):
-    """The best so far of each row of a block among places that are farther away than some distance."""
+def _compare_far(alike, row, column, places, pixels, square, top):
+    """The best so far of each row of a block among pixels that are farther from its place than some distance."""
     for i in range(alike.shape[0]):
-        one, u, v = top[row + i], pixels[row + i, 0], pixels[row + i, 1]
+        one, u, v = top[row + i], places[row + i, 0], places[row + i, 1]
         for begin in range(0, alike.shape[1], 64):
             end = min(begin + 64, alike.shape[1])
             more = np.int32(0)
@@ -147,15 +147,26 @@ def match_descriptors(first: Vectors, second: Vectors) -> IntArray:
     return np.column_stack([rows[mutual], best[rows[mutual]]])
 
 
-def alike_elsewhere(vectors: Vectors, pixels: FloatArray, beyond: float) -> FloatArray:
-    """Distances (n,) from descriptors of length one to the most alike in the same image that are farther away than so
-    many pixels; two where there is none.
+def alike_elsewhere(
+    first: Vectors, places: FloatArray, second: Vectors, pixels: FloatArray, beyond: float
+) -> FloatArray:
+    """Distances (n,) from descriptors of length one to the most alike in an image that are farther from where it would
+    see them than so many pixels; two where there is none.
+
+    Parameters
+    ----------
+    first, places : (n, 128), (n, 2)
+        Descriptors, and where the image would see them; infinite where it would not.
+    second, pixels : (m, 128), (m, 2)
+        Of the image.
+    beyond
+        Distance of another place, pixels.
     """
-    top = np.full(len(vectors), -1.0, np.float32)
-    for row in range(0, len(vectors), _ROWS):
-        for column in range(0, len(vectors), _COLUMNS):
-            alike = vectors[row : row + _ROWS] @ vectors[column : column + _COLUMNS].T
-            _compare_far(alike, row, column, pixels, beyond**2, top)
+    top = np.full(len(first), -1.0, np.float32)
+    for row in range(0, len(first), _ROWS):
+        for column in range(0, len(second), _COLUMNS):
+            alike = first[row : row + _ROWS] @ second[column : column + _COLUMNS].T
+            _compare_far(alike, row, column, places, pixels, beyond**2, top)
     return _distance(top)
 
 

@@ -2,21 +2,24 @@
 """Which points of a map look like no other place: they tell it from where the same things stand again.
 
 Windows of one facade are alike; what tells one from the next is beside them: stains, signs, doors. A point is unique if
-no other place in any image that sees it is described as much like it as views of one point are like each other.
+no other place is described as much like it as views of one point are like each other: neither in the images that see
+it, nor in those that look most like these. A window that is alone in an image, or is seen from another direction than
+the others there, has its like in the next.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.execution import map_work
+from groma.execution import map_in_threads
 from groma.gates import gate
 from groma.localization.features import Bytes, unit
-from groma.localization.matching import alike_elsewhere
+from groma.localization.matching import Vectors, alike_elsewhere
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,9 @@ class RepeatedGates:
         0.95, "quantile", "of the distances of descriptors of one point: as near ones look alike", "convention: 95 %"
     )
     sample: int = gate(20_000, "pairs", "of descriptors that this is computed from", "cost: 20 ms")
+    images: int = gate(
+        8, "images", "the most alike, that each is compared with", "convention: as many as a query is matched with"
+    )
     cells: int = gate(
         32, "cells", "per longer side: farther than one away is another place", "derived from the reach of a descriptor"
     )
@@ -49,7 +55,14 @@ class Described(NamedTuple):
         return Described(self.point[rows], self.pixel[rows], self.descriptor[rows], self.upright[rows])
 
 
-def unique_points(described: Described, begin: IntArray, sides: FloatArray, count: int) -> BoolArray:
+def unique_points(
+    described: Described,
+    begin: IntArray,
+    sides: FloatArray,
+    alike: IntArray,
+    seen_at: Callable[[int, IntArray], FloatArray],
+    count: int,
+) -> BoolArray:
     """Return which of ``count`` points look like no other place.
 
     Parameters
@@ -58,17 +71,47 @@ def unique_points(described: Described, begin: IntArray, sides: FloatArray, coun
         Points in images, and (I + 1,) where those of each image begin.
     sides : (I,)
         Longer sides of the images, pixels.
+    alike : (I, n)
+        For each image those that look most like it.
+    seen_at
+        Returns where an image would see some points, (n, 2) pixels; NaN where it would not.
     count
         Number of points.
     """
-    work = [(described.part(slice(begin[i], begin[i + 1])), float(side) / GATES.cells) for i, side in enumerate(sides)]
+    limits = alike_limits(described)
+    limit = limits[described.upright.astype(np.int64)]
+
+    def elsewhere(image: int) -> FloatArray:
+        own = slice(begin[image], begin[image + 1])
+        nearest = np.full(own.stop - own.start, np.inf)
+        for other in (image, *alike[image].tolist()):
+            there = described.part(slice(begin[other], begin[other + 1]))
+            left = own.start + np.flatnonzero(nearest > limit[own])
+            point = described.point[left]
+            places = described.pixel[left] if other == image else np.nan_to_num(seen_at(other, point), nan=np.inf)
+            for upright in (False, True):
+                rows, columns = described.upright[left] == upright, there.upright == upright
+                vectors = unit(described.descriptor[left[rows]]), unit(there.descriptor[columns])
+                far = alike_elsewhere(
+                    vectors[0], places[rows], vectors[1], there.pixel[columns], sides[other] / GATES.cells
+                )
+                nearest[left[rows] - own.start] = np.minimum(nearest[left[rows] - own.start], far)
+        return nearest
+
     nearest = np.full(count, np.inf)
-    np.minimum.at(nearest, described.point, np.concatenate([np.zeros(0), *map_work(_alike_elsewhere, work)]))
+    np.minimum.at(
+        nearest, described.point, np.concatenate([np.zeros(0), *map_in_threads(elsewhere, range(len(sides)))])
+    )
     found = np.zeros(count, bool)
-    for upright, limit in zip((False, True), alike_limits(described), strict=True):
-        points = described.point[described.upright == upright]
-        found[points] = nearest[points] > limit
+    found[described.point] = nearest[described.point] > limit
     return found
+
+
+def most_alike(images: Vectors) -> IntArray:
+    """Return (I, n) for each image those that look most like it, by descriptions (I, m) of length one."""
+    similar = images @ images.T
+    np.fill_diagonal(similar, -np.inf)
+    return np.argsort(-similar, axis=1, kind="stable")[:, : min(GATES.images, len(images) - 1)]
 
 
 def alike_limits(described: Described) -> FloatArray:
@@ -86,13 +129,3 @@ def alike_limits(described: Described) -> FloatArray:
             first, second = (unit(described.descriptor[rows[same + step]]) for step in (0, 1))
             limits[int(upright)] = np.quantile(np.linalg.norm(first - second, axis=1), GATES.alike)
     return limits
-
-
-def _alike_elsewhere(work: tuple[Described, float]) -> FloatArray:
-    """Distance from each point of an image to the most alike in another place of it."""
-    (_, pixel, descriptor, upright), beyond = work
-    out = np.empty(len(pixel))
-    for kind in (False, True):
-        rows = upright == kind
-        out[rows] = alike_elsewhere(unit(descriptor[rows]), pixel[rows], beyond)
-    return out

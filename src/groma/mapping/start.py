@@ -20,6 +20,7 @@ from groma.mapping.checkpoints import Stages, stage
 from groma.mapping.options import MapOptions, StageProgress
 from groma.mapping.posed.place import place_photographs
 from groma.mapping.posed.placed import PlacedPhotographs
+from groma.mapping.shown import check_points_shown
 from groma.scene import Scene
 
 #: Models with one and with two coefficients of radial distortion.
@@ -59,6 +60,7 @@ def find_start(
 ) -> Scene:
     """Poses and points: the given ones, or reconstructed from the images."""
     if model is not None:
+        check_points_shown(model, [folder / name for name in model.images.names])
         return model
     found = reconstruct_points(folder, place("sfm"), names, options.point_model(), say)
     if options.point_model().is_partly_calibrated:
