@@ -139,8 +139,8 @@ def _known_by_directions(
     """Normals (K, 3) and covariances (K, 3, 3), those that say nothing with the directions that lie in their planes.
 
     Directions that contradict a plane, by a chi-square test of all of them, tell nothing about it. Planes that are
-    known well enough stay as they are: of two boxes that are turned by little a common direction may be neither's. Also (K, D) what was
-    used.
+    known well enough stay as they are: of two boxes that are turned by little a common direction may be neither's.
+    Also returned are the directions (K, D) that were used.
     """
     normals, covariance = planes.planes[:, :3].copy(), planes.covariance[:, :3, :3].copy()
     inside = inside & (np.linalg.eigvalsh(covariance)[:, -1] > gates.known**2)[:, None]
