@@ -239,3 +239,19 @@ def test_nearly_parallel_lines_are_told_from_parallel_ones():
         along = (found.label == 0) & (found.probability > 0.9)
         wrong, right = wrong + along[:16].sum(), right + along[16:].sum()
     assert wrong <= 12 and right > 0.9 * 440  # of 160; some of the shutters are as good as closed
+
+
+def test_an_uncertain_line_is_likelier_along_a_direction_of_many_lines():
+    """Known to half a degree: of few others nobody knows how many lines are only nearly along their direction."""
+    probability = []
+    for sure in (4, 30):
+        rng = np.random.default_rng(20)
+        sigma = np.append(np.full(sure, 1e-3), 1e-2)
+        lines = unit(FRAME[2] + 0.3 * sigma[:, None] * rng.choice([-1, 1], (sure + 1, 3)))
+        wild = unit(rng.normal(size=(20, 3)))
+        noise = np.concatenate([sigma, np.full(20, 1e-3)])[:, None, None] ** 2 * np.eye(3)
+        found = directions_from_lines(np.concatenate([lines, wild]), noise)
+        assert len(found) == 1 and (found.label[: sure + 1] == 0).all() and found.probability[:sure].min() > 0.95
+        probability.append(found.probability[sure])
+    # Jeffreys' prior: shares of 5.5 and 0.5 lines, of which the densities tell by 1 + (8.7 / 10)^2 at most: 0.95.
+    assert probability[0] < 0.955 < 0.98 < probability[1]

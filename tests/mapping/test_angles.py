@@ -8,11 +8,14 @@ import pytest
 
 import groma
 from groma.adjustment.terms.relations import ANGLES
+from groma.estimators.directions import DirectionSet
+from groma.estimators.plane_search import PlaneSet
 from groma.gates import chi_square_gate
 from groma.geometry import quaternion, se3
 from groma.io import read_archive, write_archive
-from groma.mapping.structure.angles import AngleGates, _consistent, right_angles, vertical_of
+from groma.mapping.structure.angles import AngleGates, _consistent, angles_between, right_angles, vertical_of
 from groma.mapping.structure.find import find_structure
+from groma.mapping.structure.relations import Pairs
 from groma.mapping.unused import without_unused
 from groma.scene import Directions, KnownDirections, Planes, Relations
 from groma.scene.survey import Kind
@@ -259,3 +262,26 @@ def test_files_and_selections_keep_them(tmp_path):
     kept = related.relations.plane_across_direction
     kept = kept[(kept > 0).all(axis=1)] - 1
     assert (fewer.plane_across_direction == kept).all()
+
+
+def treads(turned, both):
+    """Two planes across Z, the second known badly about Y and turned so much, with lines along Y, and X if both are."""
+    normals = np.array([Z, np.cos(turned) * Z + np.sin(turned) * X])
+    sigma = np.array([[SIGMA, SIGMA], [0.02, SIGMA]])
+    noise = np.zeros((2, 4, 4))
+    noise[:, 0, 0], noise[:, 1, 1] = sigma.T**2
+    none, planes = np.zeros(2), np.column_stack([normals, np.zeros(2)])
+    plane_set = PlaneSet(planes, noise, none.astype(int), none, none, none, none.astype(int), none.astype(int))
+    across = SIGMA**2 * np.array([np.eye(3) - np.outer(one, one) for one in (X, Y)])
+    directions = DirectionSet(np.array([X, Y]), across, none.astype(int), none, none.astype(int))
+    on = Pairs(np.array([[0, 1], [1, 1]]), np.ones(2), none)
+    along = Pairs(np.array([[0, 1], [1, 0]])[: 1 + both], np.ones(1 + both), none[: 1 + both])
+    return angles_between(plane_set, directions, (on, along), None, 0.99)
+
+
+@pytest.mark.parametrize(("turned", "both", "parallel"), [(0.02, True, True), (0.02, False, False), (0.1, True, False)])
+def test_lines_along_two_directions_tell_a_normal(turned, both, parallel):
+    """A narrow plane is parallel to another one if two directions in it say so, and do not contradict the plane."""
+    found = treads(turned, both)
+    assert found["parallel_planes"].pairs.tolist() == ([[0, 1]] if parallel else [])
+    assert ([1, 0] in found["plane_along_direction"].pairs.tolist()) == parallel

@@ -19,7 +19,9 @@ that explains most first, as long as it does. They compete for lines, so a clust
 
 What belongs to which is decided at the end among more: lines perpendicular to a found direction are more frequent than
 others, as the edges of boxes that stand on one floor are, and so are lines that are nearly along it, as those of an
-open shutter. So each direction has its circle of the ones and its cap of the others, too, each with its own share.
+box beside another one. So each direction has its circle of the ones and its cap of the others, too, each with its own
+share. A direction of four lines does not tell whether one in ten is only nearly along it, so Jeffreys' prior is part of
+these shares: an uncertain line is along a direction of twenty more surely than along one of four.
 """
 
 from __future__ import annotations
@@ -59,8 +61,10 @@ class ParallelGates:
     )  # fmt: skip
     angles: int = gate(3, "deviations", "of directions that are tried", "cost: each twice as large as the one before")
     nearly: float = gate(
-        0.036, "rad", "that lines deviate which are nearly parallel", "convention: 2 degrees, as of nearly right angles"
-    )
+        8.7e-3, "rad", "that lines deviate which are nearly parallel",
+        "convention: half a degree, as angles that are meant to be right deviate at most",
+    )  # fmt: skip
+    prior: float = gate(0.5, "lines", "along a direction, and nearly along it, before any is seen", "Jeffreys' prior")
     max_candidates: int = gate(256, "directions", "candidates of one round", "cost: time of a search")
     max_refined: int = gate(3, "directions", "best candidates that are refined", "cost: time of a search")
     rounds: int = gate(15, "rounds", "of expectation and maximisation", "cost: converges in fewer")
@@ -296,6 +300,9 @@ def _settled(
     kinds = 1 + 2 * num * with_more
     others = np.full(kinds, max(1.0 - share.sum(), 1e-12) / kinds)
     shares, mine, squared = np.concatenate([share, others]), np.zeros((num, len(pool))), np.zeros((num, len(pool)))
+    prior = np.zeros(len(shares))
+    if with_more:
+        prior[:num] = prior[num + 1 : 2 * num + 1] = PARALLEL.prior  # of directions and their caps
     for _ in range(PARALLEL.rounds if num else 0):
         parts = [_members(pool, vectors), _anywhere(pool)]
         if with_more:
@@ -303,7 +310,8 @@ def _settled(
         mixed = np.log(np.maximum(shares, 1e-300))[:, None] + np.vstack(parts)
         probability = np.exp(mixed - mixed.max(axis=0))
         probability /= probability.sum(axis=0)
-        shares, mine, squared = probability.mean(axis=1), probability[:num], pool.squared(vectors)
+        shares = (probability.sum(axis=1) + prior) / (len(pool) + prior.sum())
+        mine, squared = probability[:num], pool.squared(vectors)
         weight = mine * (PARALLEL.freedom + 2.0) / (PARALLEL.freedom + squared)
         vectors = _mean(pool, weight, vectors)
     return vectors, shares[:num], mine, squared

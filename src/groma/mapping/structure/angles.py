@@ -109,7 +109,7 @@ def angles_between(
     last direction.
     """
     inside = _inside(*lines, len(planes), len(directions))
-    normals, noise = _known_by_directions(planes, directions, inside, level)
+    normals, noise, inside = _known_by_directions(planes, directions, inside, level)
     vectors = [normals, directions.vectors, *([] if vertical is None else [vertical[0][None]])]
     covariance = [noise, directions.covariance, *([] if vertical is None else [vertical[1][None]])]
     is_direction = np.arange(sum(map(len, vectors))) >= len(planes)
@@ -137,12 +137,15 @@ def _inside(on: Pairs, along: Pairs, num_planes: int, num_directions: int) -> Bo
 
 def _known_by_directions(
     planes: PlaneSet, directions: DirectionSet, inside: BoolArray, level: float, gates: AngleGates = GATES
-) -> tuple[FloatArray, FloatArray]:
-    """Normals (K, 3) and covariances (K, 3, 3), the better known ones by the directions that lie in their planes.
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Normals (K, 3) and covariances (K, 3, 3), those that say nothing with the directions that lie in their planes.
 
-    Directions that contradict a plane, by a chi-square test of all of them, tell nothing about it.
+    Directions that contradict a plane, by a chi-square test of all of them, tell nothing about it. Planes that are
+    known well enough stay as they are: of two boxes that are turned by little a common direction may be neither's.
+    Also returned are the directions (K, D) that were used.
     """
     normals, covariance = planes.planes[:, :3].copy(), planes.covariance[:, :3, :3].copy()
+    inside = inside & (np.linalg.eigvalsh(covariance)[:, -1] > gates.known**2)[:, None]
     for k in np.flatnonzero(inside.any(axis=1)).tolist():
         normal, of = normals[k], np.flatnonzero(inside[k])
         axes, vectors = np.stack(perpendicular(normal)), directions.vectors[of]
@@ -150,11 +153,12 @@ def _known_by_directions(
         noise = np.diag(np.einsum("i,dij,j->d", normal, directions.covariance[of], normal) + gates.exact**2)
         total = slope @ own @ slope.T + noise
         if off @ np.linalg.solve(total, off) > chi_square_gate(1.0 - level, len(of)):
+            inside[k] = False
             continue
         gain = np.linalg.solve(total, slope @ own).T
         normals[k] = unit(normal - axes.T @ (gain @ off))
         covariance[k] = axes.T @ (own - gain @ slope @ own) @ axes
-    return normals, covariance
+    return normals, covariance, inside
 
 
 def vertical_of(scene: Scene) -> Vector | None:
