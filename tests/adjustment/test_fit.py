@@ -106,7 +106,7 @@ def test_cameras_that_are_not_determined_are_told():
     result = groma.adjust(scene.replace(point_observations=table.take(halves)), groma.AdjustOptions(loss="none"))
     numbers = result.pose_uncertainty()
     assert numbers is not None and numbers["center"] == {"median": None, "largest": None, "undetermined": 10}
-    assert "rank deficient" in numbers["why_not"]
+    assert "rank deficient" in numbers["why_not"] and "The diagnosis (--diagnosis; in Python" in numbers["why_not"]
     told = describe_pose_uncertainty(numbers)
     assert told == [f"Cameras: how well they are known cannot be told. {numbers['why_not']}"]
     assert describe_pose_uncertainty(None) == []

@@ -92,8 +92,7 @@ class AdjustOptions:
     #: in the scene are relative to it. Losses are scaled in these units.
     point_sigma_px: float = 1.0
     line_sigma_px: float = 1.0
-    #: Correlation of the errors of a segment's two ends:
-    #: see :class:`groma.adjustment.assembly_options.AssemblyOptions`.
+    #: Correlation of the errors of both ends of a segment (:class:`groma.adjustment.assembly_options.AssemblyOptions`).
     line_end_correlation: float = 0.0
     #: How segments and measured planes are compared with landmarks: ``endpoints``, ``bearing`` or ``normal``, and
     #: ``normal_offset`` or ``quaternion``: see :class:`groma.adjustment.assembly_options.AssemblyOptions`.
@@ -101,8 +100,7 @@ class AdjustOptions:
     plane_residual: str = "normal_offset"
     #: Terms of your own kinds of measurements: see :mod:`groma.adjustment.terms.contract`.
     terms: tuple[Term, ...] = ()
-    #: Residual of relations between landmarks: ``metric`` or ``pixels``, and the standard deviation if metric: see
-    #: :class:`groma.adjustment.assembly_options.AssemblyOptions`.
+    #: Residual of relations between landmarks: ``metric`` or ``pixels``, and the standard deviation if metric.
     structure_form: str = "metric"
     structure_sigma_px: float = SURFACE_SIGMA_PX
     #: Use the relation of lines that meet: see :class:`groma.adjustment.assembly_options.AssemblyOptions`.

@@ -88,7 +88,8 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
     Parameters
     ----------
     path : path
-        A folder (with the model in it, in ``sparse`` or in ``sparse/0``) or a file; see the page *File formats*.
+        A folder (with the model in it, in ``sparse`` or in ``sparse/0``; or a result of groma, which is read by its
+        ``scene.npz``) or a file; see the page *File formats*.
 
     Returns
     -------

@@ -28,6 +28,7 @@ from groma.solver.linear.schur import ReducedSystem
 LOOSE, MAX_LOOSE = 1e-6, 0.2
 #: Modes of zero cost that are sought at most (cost: time and memory).
 MAX_MODES = 1024
+_DIAGNOSIS = "The diagnosis (--diagnosis; in Python groma.solver.observability.diagnosis.diagnose)"
 
 
 def hold_cancelled_coordinates(system: ReducedSystem) -> tuple[list[BoolArray], FloatArray]:
@@ -123,8 +124,7 @@ def deficiency(layout: Layout, modes: Modes, num_free: int) -> ProblemError:
     if not len(modes.values):
         return ProblemError(
             "The normal equations are spoilt by rounding: some residual changes far more than all others when its "
-            "variables move. groma.solver.observability.diagnosis.diagnose(problem) may name them; drop them, or "
-            "adjust with a loss."
+            f"variables move. {_DIAGNOSIS} may name them; leave them out, or adjust with a robust loss."
         )
     number = f"at least {modes.num_null}" if modes.num_null == len(modes.values) else str(max(modes.num_null, 1))
     if num_free:
@@ -141,7 +141,7 @@ def deficiency(layout: Layout, modes: Modes, num_free: int) -> ProblemError:
     what = f"; {moved} of {total} poses are not determined" if moved else ""
     return ProblemError(
         f"The normal equations are rank deficient by {number}{what}. "
-        "groma.solver.observability.diagnosis.diagnose(problem) names what is not determined; drop it, or add priors."
+        f"{_DIAGNOSIS} names what is not determined; leave it out, or add observations or measurements of it."
     )
 
 
