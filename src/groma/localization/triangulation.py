@@ -21,14 +21,14 @@ from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.fit import noise_of
 from groma.adjustment.stages import with_loss
 from groma.factors.contract import Factor
-from groma.factors.losses import Cauchy, GemanMcClure
+from groma.factors.losses import Cauchy
 from groma.features.matching.wide_baseline import fundamental_from_poses
 from groma.gates import chi_square_gate, gate
 from groma.geometry import quaternion, se3
 from groma.localization.features import DescribedPoints, unit
 from groma.localization.matching import match_descriptors
 from groma.localization.pose.camera import QueryCamera
-from groma.localization.pose.records import landmark_covariances, residual_squares
+from groma.localization.pose.records import LANDMARK_LOSS, landmark_covariances, residual_squares
 from groma.scene import PointObservations, Points, Scene
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
@@ -147,7 +147,7 @@ def _points(scene: Scene, seen: _Observed, straight: FloatArray, count: int) -> 
     xyz = _nearest_to_rays(scene, seen, straight)
     covariance, scale = np.zeros((len(xyz), 3, 3)), 1.0
     bare = scene.keep(points=[], lines=[], planes=[], directions=[])
-    for loss in (Cauchy(2.0), GemanMcClure(3.0)):
+    for loss in (Cauchy(2.0), LANDMARK_LOSS):
         good = np.isfinite(xyz).all(axis=1) & (np.bincount(seen.track, minlength=len(xyz)) > 1)
         seen = seen.take(good[seen.track])
         if not len(seen.row):

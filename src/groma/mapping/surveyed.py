@@ -13,6 +13,7 @@ from typing import Any
 
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult, Progress
+from groma.adjustment.rolling_shutter import Motions, adjust_rolling_shutter, motions_of
 from groma.adjustment.survey.attach import Survey, Surveyed, with_survey
 from groma.adjustment.survey.given_poses import given_poses_of
 from groma.adjustment.survey.gross_errors import reliability_of, without_gross_errors
@@ -53,6 +54,8 @@ class SurveyedResult:
     surveyed: Surveyed
     #: Tests of the measurements; None where the poses are not determined.
     reliability: Reliability | None
+    #: How the cameras moved while images were read; None with a global shutter.
+    motions: Motions | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values: the entry ``survey`` of ``summary.json``."""
@@ -76,7 +79,7 @@ def adjust_surveyed(
     Parameters
     ----------
     scene : Scene
-        Adjusted already, in any frame.
+        Adjusted already, in any frame; or with ``camera_motions``, which are estimated first, without the measurements.
     survey : Survey, optional
         Measurements to add; without, those that the scene holds are used.
     options : AdjustOptions, optional
@@ -92,9 +95,13 @@ def adjust_surveyed(
         If measurements and scene do not fit together.
     """
     check_scene_given(scene)
-    surveyed = (
-        with_survey(scene, survey) if survey else Surveyed(scene, Similarity(), WorldFrame("the frame of the scene"))
-    )
+    unmoved, motions = Surveyed(scene, Similarity(), WorldFrame("the frame of the scene")), None
+    if len(scene.camera_motions):
+        rolled = adjust_rolling_shutter(scene, options, progress)
+        if survey is None and not scene.has_survey:
+            return SurveyedResult(rolled.result, unmoved, None, rolled.motions)
+        scene, motions = rolled.result.scene, rolled.motions
+    surveyed = with_survey(scene, survey) if survey else replace(unmoved, scene=scene)
     if keep_suspects:
         surveyed = replace(surveyed, scene=with_rejected(surveyed.scene, ()))
     chosen = weighted(surveyed.scene, options or AdjustOptions())
@@ -107,9 +114,12 @@ def adjust_surveyed(
         chosen = better
         result = adjust(surveyed.scene, chosen, progress)
     if keep_suspects:
-        return SurveyedResult(result, surveyed, reliability_of(result.scene, result.problem))
-    result, found = without_gross_errors(result, lambda scene: adjust(scene, chosen, progress))
-    return SurveyedResult(result, surveyed, found)
+        found = reliability_of(result.scene, result.problem)
+    else:
+        result, found = without_gross_errors(result, lambda scene: adjust(scene, chosen, progress))
+    if len(result.scene.camera_motions):
+        motions = motions_of(result.scene, result.problem)
+    return SurveyedResult(result, surveyed, found, motions)
 
 
 @dataclass(frozen=True, eq=False)

@@ -168,25 +168,17 @@ def _adjusted(
             raise InputError(
                 f"{option} is of measurements; there are none. Add --positions, --control, --distances or others."
             )
-    if not surveyed and wanted.rolling_shutter is None and not len(before.camera_motions):
+    if wanted.rolling_shutter is not None:
+        from groma.adjustment.rolling_shutter import with_rolling_shutter
+
+        before = with_rolling_shutter(before, wanted.rolling_shutter)
+    if not surveyed and not len(before.camera_motions):
         return before, adjust(before, options, progress), None, None
-    from groma.adjustment.rolling_shutter import adjust_rolling_shutter, motions_of, with_rolling_shutter
     from groma.mapping.surveyed import adjust_surveyed  # with what finds noise in images
 
-    if wanted.rolling_shutter is not None:
-        before = with_rolling_shutter(before, wanted.rolling_shutter)
-    rolled = adjust_rolling_shutter(before, options, progress) if len(before.camera_motions) else None
-    if not surveyed:
-        if rolled is None:
-            return before, adjust(before, options, progress), None, None
-        return before, rolled.result, None, rolled.motions
     survey = wanted.measured.read(None, lambda: before.images.names) if wanted.measured else None
-    kept = wanted.measured.keep_suspects
-    found = adjust_surveyed(before if rolled is None else rolled.result.scene, survey, options, progress, kept)
-    motions = None if rolled is None else rolled.motions
-    if len(found.result.scene.camera_motions):
-        motions = motions_of(found.result.scene, found.result.problem)
-    return found.surveyed.scene, found.result, found.to_dict(), motions
+    found = adjust_surveyed(before, survey, options, progress, wanted.measured.keep_suspects)
+    return found.surveyed.scene, found.result, found.to_dict() if surveyed else None, found.motions
 
 
 def why_no_covariances(scene: Scene, path: Path) -> list[str]:

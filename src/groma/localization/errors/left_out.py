@@ -19,10 +19,12 @@ from groma._typing import BoolArray, FloatArray
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pose_problem import problem_of
-from groma.localization.pose.records import motions_of_lines
+from groma.localization.pose.records import LANDMARK_LOSS, motions_of_lines
 
 #: A landmark whose information falls below this share in some direction hung on the image that was left out.
 _LEFT = 1e-2
+#: Eigenvalues are known to about this share of the largest (derived from the precision of doubles).
+_ROUNDING = 4.0 * np.finfo(np.float64).eps
 
 
 def without_image(camera: QueryCamera, matches: Matches, pose: FloatArray) -> Matches:
@@ -67,11 +69,10 @@ def _downdated(white: FloatArray, covariance: FloatArray, free: FloatArray) -> t
     ``white`` are whitened records (n, 2, k + 1), ``free`` bases (n, k, m) of what the landmarks can do.
     """
     J, r = white[..., :-1] @ free, white[..., -1]
-    weight = 1.0 / (1.0 + (r**2).sum(axis=1) / 9.0) ** 2
-    before = np.linalg.inv(np.swapaxes(free, 1, 2) @ covariance @ free)
-    values, vectors = np.linalg.eigh(before)
-    known = values[:, 0] > 0.0  # what is hardly determined may be negative, by rounding
-    root = vectors / np.sqrt(np.where(known[:, None], values, 1.0))[:, None, :]  # inside it, information is one
+    weight = LANDMARK_LOSS.evaluate((r**2).sum(axis=1))[1]
+    values, vectors = np.linalg.eigh(np.swapaxes(free, 1, 2) @ covariance @ free)
+    known = values[:, 0] > _ROUNDING * values[:, -1]  # beside what is hardly determined, the rest is rounding
+    root = vectors * np.sqrt(np.where(known[:, None], values, 1.0))[:, None, :]  # inside it, information is one
     inside = J @ root
     left, axes = np.linalg.eigh(np.eye(inside.shape[2]) - np.einsum("n,nki,nkj->nij", weight, inside, inside))
     good = known & (left[:, 0] > _LEFT)

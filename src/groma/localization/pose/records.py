@@ -9,7 +9,11 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.factors.contract import Factor
+from groma.factors.losses import GemanMcClure
 from groma.problem.problem import Problem
+
+#: Loss that landmarks of a map are estimated with in the end (convention: three standard deviations).
+LANDMARK_LOSS = GemanMcClure(3.0)
 
 
 def landmark_rows(factor: Factor, group: str) -> IntArray | None:
@@ -67,7 +71,7 @@ def landmark_covariances(problem: Problem, group: str, count: int) -> FloatArray
             continue
         record = records(problem, factor, {group[:-1]: size})
         white = times(factor.sqrt_information, record)
-        J, weight = white[..., :size], 1.0 / (1.0 + (white[..., size] ** 2).sum(axis=1) / 9.0) ** 2
+        J, weight = white[..., :size], LANDMARK_LOSS.evaluate((white[..., size] ** 2).sum(axis=1))[1]
         np.add.at(total, rows, np.einsum("n,nki,nkj->nij", weight, J, J))
     free = np.broadcast_to(np.eye(3), (count, 3, 3))
     if group == "lines":

@@ -13,12 +13,13 @@ from groma.io.drawn import direction_of_lines
 from groma.scene import Scene
 from groma.scene.line_intervals import line_pieces
 from groma.scene.patches import PALETTE, patch_area, patch_groups
+from groma.scene.table import new_index_of
 from groma.viz import colours as _colours
 from groma.viz.drawable import Drawable, junctions
 from groma.viz.framing import starting_view
 from groma.viz.pack import pack, pack_bytes, pack_whole
 from groma.viz.report.covariances import LandmarkCovariances
-from groma.viz.report.kept import Kept, places_of
+from groma.viz.report.kept import Kept
 from groma.viz.statistics import LineStatistics, images_of, line_statistics
 
 
@@ -30,7 +31,7 @@ def scene_data(
     offset = _middle(after)
     meeting = kept.meeting(scene)
     owner = line_pieces(scene)[1]
-    drawn = np.flatnonzero(places_of(kept.lines, scene.num_lines)[owner] >= 0)
+    drawn = np.flatnonzero(new_index_of(kept.lines, scene.num_lines)[owner] >= 0)
     numbers = [line_statistics(one, shown) for one, shown in zip(scenes, states, strict=True)]
     point_errors = [shown.point_errors[kept.points] for shown in states]
     line_errors = [found.residual_px[kept.lines] for found in numbers]
@@ -49,14 +50,14 @@ def scene_data(
             for one, shown, errors, far in zip(scenes, states, point_errors, line_errors, strict=True)
         ],
         "offset": offset.tolist(),
-        "pieces": pack_whole(places_of(kept.lines, scene.num_lines)[owner[drawn]]),
+        "pieces": pack_whole(new_index_of(kept.lines, scene.num_lines)[owner[drawn]]),
         "points": _points(scene, after, kept),
         "lines": _lines(scene, numbers[-1], kept),
         "planes": _planes(scene, after),
         "directions": {"ids": pack_whole(scene.directions.ids)},
         "cameras": _cameras(scene),
         "relations": _relations(scene, kept),
-        "junctions": pack_whole(places_of(kept.lines, scene.num_lines)[meeting]),
+        "junctions": pack_whole(new_index_of(kept.lines, scene.num_lines)[meeting]),
         "covariances": None if covariances is None else _covariances(covariances, kept, offset),
         "view": {
             "pivot": (view.pivot - offset).tolist(),
@@ -116,7 +117,7 @@ def _cameras(scene: Scene) -> dict[str, Any]:
 
 def _relations(scene: Scene, kept: Kept) -> dict[str, str]:
     """Return relations as pairs of indices into the kept landmarks."""
-    point, line = places_of(kept.points, scene.num_points), places_of(kept.lines, scene.num_lines)
+    point, line = new_index_of(kept.points, scene.num_points), new_index_of(kept.lines, scene.num_lines)
     plane = np.arange(scene.num_planes)
     ends = {
         "line_on_plane": (line, plane),

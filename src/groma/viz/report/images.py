@@ -17,10 +17,11 @@ from groma._typing import FloatArray, IntArray
 from groma.execution import begin
 from groma.scene import Scene
 from groma.scene.line_intervals import one_line_per_interval
+from groma.scene.table import new_index_of
 from groma.viz.drawable import Drawable
 from groma.viz.pack import pack, pack_whole, thin
 from groma.viz.pictures import ImageFiles, image_file, jpeg_address, read_picture, warn_of_names_outside
-from groma.viz.report.kept import Kept, places_of
+from groma.viz.report.kept import Kept
 from groma.viz.report.overlays import projected_places
 
 #: Maximum number of photographs, their longer side in pixels, and their total size in characters.
@@ -111,9 +112,9 @@ def image_data(scene: Scene, kept: Kept, states: Sequence[Drawable], photographs
         "images": entries,
         "first": _first(entries),
         "rows": pack(np.concatenate([after.residual_place[:num_points][rows], *point_ways], axis=1)),
-        "row_points": pack_whole(places_of(kept.points, scene.num_points)[scene.point_observations.point_idx[rows]]),
+        "row_points": pack_whole(new_index_of(kept.points, scene.num_points)[scene.point_observations.point_idx[rows]]),
         "segments": pack(np.concatenate([seen.segment[segments], *ways], axis=1)),
-        "segment_lines": pack_whole(places_of(kept.lines, scene.num_lines)[seen.line_idx[segments]]),
+        "segment_lines": pack_whole(new_index_of(kept.lines, scene.num_lines)[seen.line_idx[segments]]),
         "projected": pack(np.concatenate([*projected, np.zeros((0, 2 * samples))])),
         "samples": samples,
     }

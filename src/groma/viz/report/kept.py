@@ -52,13 +52,6 @@ def kept(scene: Scene) -> Kept:
     )
 
 
-def places_of(rows: IntArray, count: int) -> IntArray:
-    """Return the index of each of ``count`` items among the kept rows; -1 if it is not kept."""
-    place = np.full(count, -1, np.int64)
-    place[rows] = np.arange(len(rows))
-    return place
-
-
 def _member(rows: IntArray, count: int) -> BoolArray:
     found = np.zeros(count, bool)
     found[rows] = True
