@@ -123,7 +123,7 @@ def rate(files: list[Path]) -> str:
         some = [row for row in rows if (row["map"], row["kind"]) == (place, kind)]
         counts = [sum(row["status"] == "localized" for row in some), sum(row["wrong"] for row in some)]
         counts.append(sum(row["status"] == "uncertain" for row in some))
-        lines.append(" | ".join(["|", place, kind, str(len(some)), *map(str, counts), "|"]).strip())
+        lines.append(f"| {' | '.join([place, kind, str(len(some)), *map(str, counts)])} |")
     n, k = len(rows), sum(row["wrong"] for row in rows)
     low, high = interval(k, n)
     return "\n".join(

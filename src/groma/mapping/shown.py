@@ -27,7 +27,12 @@ from groma.scene import Scene
 class ShownGates:
     """How photographs are compared with the points of a model."""
 
-    pairs: int = gate(5, "pairs", "of photographs that are compared at most", "cost: a sixth of a second each")
+    pairs: int = gate(
+        5,
+        "pairs",
+        "that are compared: the images that see most points, each with another",
+        "cost: a sixth of a second each",
+    )
     points: int = gate(200, "points", "of a pair at most", "cost: of describing them")
     least: int = gate(20, "points", "of a pair at least", "derived from ranks: the share is good to a tenth")
     size: float = gate(8.0, "px", "diameter of the places that are described", "convention: as localisation does")
@@ -59,8 +64,9 @@ def check_points_shown(scene: Scene, files: Sequence[Path], gates: ShownGates = 
         If most pairs that were looked at do not.
     """
     pairs: list[tuple[float, str]] = []
-    for image in np.unique(np.linspace(0, scene.num_images - 1, min(gates.pairs, scene.num_images)).astype(int)):
-        other, pixels = _shared(scene, int(image), gates)
+    count = np.bincount(scene.point_observations.image_idx, minlength=scene.num_images)
+    for image in np.argsort(-count, kind="stable")[: gates.pairs].tolist():
+        other, pixels = _shared(scene, image, gates)
         first, second = (_described(files[i], own, gates.size) for i, own in zip((image, other), pixels, strict=True))
         shown = first.any(axis=1) & second.any(axis=1)
         if shown.sum() < gates.least:
