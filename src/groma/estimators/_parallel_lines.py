@@ -64,7 +64,9 @@ class ParallelGates:
         8.7e-3, "rad", "that lines deviate which are nearly parallel",
         "convention: half a degree, as angles that are meant to be right deviate at most",
     )  # fmt: skip
-    prior: float = gate(0.5, "lines", "along a direction, and nearly along it, before any is seen", "Jeffreys' prior")
+    prior: float = gate(
+        0.5, "lines", "along a direction, and nearly along it, before any is seen", "derived from Jeffreys' prior"
+    )
     max_candidates: int = gate(256, "directions", "candidates of one round", "cost: time of a search")
     max_refined: int = gate(3, "directions", "best candidates that are refined", "cost: time of a search")
     rounds: int = gate(15, "rounds", "of expectation and maximisation", "cost: converges in fewer")
