@@ -12,6 +12,7 @@ from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.survey.place import settled
 from groma.adjustment.survey.reliability import reliability
 from groma.evaluation import evaluate_poses
+from groma.geometry import so3
 from groma.scene.measurements import PosePriors
 from groma.scene.survey import CameraPositions, Distances, Kind, KnownDirections, diagonal_covariance
 from groma.scene.synthetic import holistic
@@ -76,3 +77,14 @@ def test_the_held_scale_is_no_measurement_to_test():
     down = KnownDirections([Kind.IMAGE], [0], [[0.0, 0.0, -1.0]], [[0.0, 1.0, 0.0]], [0.1])
     found = reliability(scene.replace(known_directions=down))
     assert found is not None and {one.kind for one in found.measurements} == {"known direction"}
+
+
+def test_a_scene_is_placed_at_its_poses_which_stay():
+    """Beside positions that know less, too: poses that moved with the scene would turn it by as much in each step."""
+    _, scene = _at_poses(1.0)
+    away = scene.transformed(groma.scene.Similarity(1.1, so3.exp(np.array([[0.1, 0.2, -0.1]]))[0], np.ones(3)))
+    away = away.replace(pose_priors=scene.pose_priors)
+    rough = _at_positions(50.0).camera_positions
+    for one in (away, away.replace(camera_positions=rough)):
+        np.testing.assert_allclose(settled(one).cam_from_world, scene.cam_from_world, atol=1e-5)
+        np.testing.assert_array_equal(settled(one).pose_priors.rig_from_world, scene.pose_priors.rig_from_world)

@@ -58,9 +58,13 @@ def settled(scene: Scene) -> Scene:
 
     The scale is kept, too, if depths or stereo pairs determine it; scenes with held objects are left unchanged.
     """
-    if not (scene.is_tied or len(scene.distances)) or len(scene.held) or not scene.num_images:
+    if not (scene.has_survey or len(scene.pose_priors)) or len(scene.held) or not scene.num_images:
         return scene
-    return scene.transformed(_best(scene), measured=False)
+    return _moved(scene, _best(scene))
+
+
+def _moved(scene: Scene, similarity: Similarity) -> Scene:
+    return scene.transformed(similarity, measured=False).replace(pose_priors=scene.pose_priors)
 
 
 def _best(scene: Scene) -> Similarity:
@@ -78,7 +82,7 @@ def _best(scene: Scene) -> Similarity:
         step = np.zeros(7)
         step[:free] = -np.linalg.pinv(scaled, rcond=_UNKNOWN, hermitian=True) @ (gradient[:free] / size) / size
         next_ = _similarity(step, total.points(middle), length * total.scale)
-        light, total = light.transformed(next_, measured=False), next_.after(total)
+        light, total = _moved(light, next_), next_.after(total)
         if np.abs(step[:free] * size).max() <= _TOLERANCE:  # in standard deviations
             break
     return total
