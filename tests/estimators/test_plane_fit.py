@@ -108,7 +108,6 @@ def body(seed):
     return points + rng.normal(0.0, SIGMA, points.shape)
 
 
-@pytest.mark.kernels
 @pytest.mark.parametrize("rough", [4.5, 7.0, 10.0])
 def test_a_rough_wall_has_one_plane(rough):
     """One that is as rough as ten times the noise; its normal is right to four deviations of its fit."""
@@ -121,7 +120,6 @@ def test_a_rough_wall_has_one_plane(rough):
     assert abs(found.planes[0, 2]) > np.cos(4.0 * rough * SIGMA * np.sqrt(12.0 / 800.0) / 40.0)
 
 
-@pytest.mark.kernels
 def test_no_rough_plane_through_steps():
     """Each tread has its plane; the slope through all of them has none of its own."""
     rng = np.random.default_rng(14)
