@@ -108,6 +108,26 @@ def body(seed):
     return points + rng.normal(0.0, SIGMA, points.shape)
 
 
+@pytest.mark.parametrize("rough", [4.5, 7.0, 10.0])
+def test_a_rough_wall_has_one_plane(rough):
+    """One that is as rough as ten times the noise; its normal is right to four deviations of its fit."""
+    rng = np.random.default_rng(12)
+    points = wall(rng, 800, 2, 1.0, size=40.0)
+    points[:, 2] += rough * SIGMA * rng.standard_normal(800)
+    found = find_planes(points, noise_of(points))
+    assert len(found) == 1 and (found.point_label == 0).mean() > 0.9
+    # The spread of an even square is its side over root twelve.
+    assert abs(found.planes[0, 2]) > np.cos(4.0 * rough * SIGMA * np.sqrt(12.0 / 800.0) / 40.0)
+
+
+def test_no_rough_plane_through_steps():
+    """Each tread has its plane; the slope through all of them has none of its own."""
+    rng = np.random.default_rng(14)
+    points = np.concatenate([wall(rng, 150, 2, 0.15 * k, 1.0, (0.0, 1.0 * k)) for k in range(6)])
+    found = find_planes(points, noise_of(points))
+    assert len(found) == 6 and (np.abs(found.planes[:, 2]) > np.cos(0.05)).all()
+
+
 def test_a_round_body_has_no_plane():
     """It fills one side of the layer of planes that touch it: with chances as of both sides 22 are found on these."""
     bodies = [body(seed) for seed in range(8)]
