@@ -174,7 +174,7 @@ def adjust(
 
 def _settled(scene: Scene, options: AdjustOptions, progress: Callable[[Progress], bool | None] | None) -> AdjustResult:
     """Adjust a scene that is first and last placed where measurements of other instruments fit best."""
-    if not ((scene.has_survey or len(scene.pose_priors)) and options.refine_poses):
+    if not (scene.has_survey and options.refine_poses):
         return _adjusted(scene, options, progress)
     result = _adjusted(settled(scene), options, progress)
     after = settled(result.scene)
