@@ -7,7 +7,8 @@ is found again in any photograph. How often, the map knows from its own images: 
 them see, and that its pose puts into it, it sees some itself, the more the more of the others do.
 
 Where a place repeats, another that looks like it shows what repeats in every part. What only this place has is missing
-there: points that look like no other (:mod:`groma.localization.repeated`). They are to be found about as often as all.
+there: points that look like no other (:mod:`groma.localization.repeated`). They are to be found about as often as all;
+few of them say little, so what counts is the lower limit of how often they are.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import gammaincinv
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.localization.landmarks import counted_in
@@ -77,7 +79,7 @@ def shown_of(
     lines: bool = True,
 ) -> tuple[tuple[float, float], float]:
     """Return how many parts of an image show what a pose puts there and how many show none of it; and how often what
-    only this place has is found, as a share of how often all of it is.
+    only this place has is found at least, as a share of how often all of it is.
 
     Parts count by what is expected in them, points and lines alike.
 
@@ -110,10 +112,15 @@ def shown_of(
 
 
 def _often_alone(rate: FloatArray, found: BoolArray, unique: BoolArray, least: float) -> float:
-    """How often unique points are found, as a share of how often all are; one where hardly any are expected."""
+    """How often unique points are found, as a share of how often all are; one where hardly any are expected.
+
+    It is the lower limit of the mean of a Poisson variable, at ``VERDICT.often`` (Garwood 1936).
+    """
     often = min(1.0, float(found.sum()) / max(float(rate.sum()), 1e-12))
-    expected = often * float(rate[unique].sum())
-    return 1.0 if expected < least else float(found[unique].sum()) / expected
+    expected, count = often * float(rate[unique].sum()), int(found[unique].sum())
+    if expected < least:
+        return 1.0
+    return float(gammaincinv(count, VERDICT.often)) / expected if count else 0.0
 
 
 def _counted(

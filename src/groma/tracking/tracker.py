@@ -217,7 +217,7 @@ class Tracker:
         with watch("turn"):
             predicted, prior_sigma = self._with_turn(data, predicted, prior_sigma)
         estimate, followed = follow_frame(
-            self.map, present.data, data, present.followed, present.pose, predicted, prior_sigma, watch,
+            self.map, present.data, data, present.followed, present.pose, (predicted, prior_sigma), watch,
             self._mapper.frame_pool, self._searched,
         )  # fmt: skip
         if estimate is None:

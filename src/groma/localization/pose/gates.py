@@ -78,9 +78,12 @@ class VerdictGates:
         0.99, "probability", "that more of what is expected is there than is missing", "chosen on the filing cabinet"
     )
     alone: float = gate(
-        0.5, "share", "of how often all points are found, that unique ones are found",
-        "derived from the two places: one here, nothing in another",
+        0.25, "share", "of how often all points are found, that unique ones are found at least",
+        "chosen on rendered facades: what is found in another place that looks like this one",
     )  # fmt: skip
+    often: float = gate(
+        0.01, "probability", "that unique points are found less often than that", "convention: 1 in 100"
+    )
     focal: float = gate(
         0.01, "share", "of the focal length: a step of its estimate that tells another lens", "convention: a hundredth"
     )

@@ -183,16 +183,16 @@ def doubted_if_missing(verdict: Verdict, shown: float, missing: float) -> Verdic
 
 
 def doubted_if_repeated(verdict: Verdict, often: float) -> Verdict:
-    """Return a verdict, or ``uncertain`` where more of what only this place has is missing than is there.
+    """Return a verdict, or ``uncertain`` where what only this place has is not surely found.
 
-    ``often`` is how often points that look like no other are found, as a share of how often all points are: one in this
-    place, nothing in another that looks like it.
+    ``often`` is how often points that look like no other are found at least, as a share of how often all points are:
+    about one in this place, a few by chance in another that looks like it.
     """
     if verdict.status != "localized" or often >= VERDICT.alone:
         return verdict
     words = (
-        f"{verdict.sentence} But points that look like no other place are found {100 * often:.0f} % as often as all: "
-        "the photograph may show another place that looks like this one."
+        f"{verdict.sentence} But points that look like no other place may be found only {100 * often:.0f} % as often "
+        "as all: the photograph may show another place that looks like this one."
     )
     return Verdict("uncertain", 1.0 - VERDICT.right, words)
 

@@ -44,18 +44,19 @@ def follow_frame(
     data: FrameFeatures,
     followed: Followed,
     previous: FloatArray,
-    predicted: FloatArray,
-    prior_sigma: FloatArray,
+    expected: tuple[FloatArray, FloatArray],
     watch,
     pool: Executor | None = None,
     searched: bool = False,
 ) -> tuple[PoseEstimate | None, Followed]:
     """Return the pose of a frame that follows another, and what is still followed.
 
-    Lines and planes are found beside points in a pool. Where so few points are left that features will be asked
-    anyway, lines are not followed; they do not begin before points if the frame before was ``searched``.
+    ``expected`` is the predicted pose with its standard deviations (6,). Lines and planes are found beside points in a
+    pool. Where so few points are left that features will be asked anyway, lines are not followed; they do not begin
+    before points if the frame before was ``searched``.
     """
     camera, options, gates = data.camera, data.options, data.options.gates
+    predicted, prior_sigma = expected
     tracks, segments = followed.points, followed.lines
     with_lines = options.lines and len(segments.index) > 0
     at_once = pool if with_lines and not searched else None
