@@ -30,7 +30,7 @@ from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult, Progress
 from groma.adjustment.terms.readout import MOTIONS
 from groma.errors import InputError, ProblemError
-from groma.gates import chi_square_gate, gate
+from groma.gates import NORMAL, chi_square_gate, gate
 from groma.geometry import quaternion
 from groma.problem.problem import Problem
 from groma.scene import CameraMotions, Scene
@@ -64,9 +64,6 @@ class RollingShutterGates:
     )
     max_rounds: int = gate(4, "adjustments", "of a scene", "cost: most need three")
     max_images: int = gate(300, "images", "for which redundancy is computed; of more it is taken as one", "cost: time")
-    false_alarm: float = gate(
-        1e-3, "probability", "of a sequence where there is none", "convention: three sigma on one side"
-    )
     parallel: float = gate(
         np.radians(30.0),
         "rad",
@@ -307,7 +304,7 @@ def _share(free: FloatArray, known: FloatArray, between: FloatArray, sigma: Floa
         w, v, d = known[:, part], free[:, part], between[:, part]
         nothing, something = ((w * (v - factor * d) ** 2).sum() for factor in (0.0, share))
         gain += v.size * float(np.log(max(nothing, 1e-300) / max(something, 1e-300)))
-    return share if gain > chi_square_gate(GATES.false_alarm, 1) else 0.0
+    return share if gain > chi_square_gate(NORMAL.gross, 1) else 0.0
 
 
 def _spread(scene: Scene, table: CameraMotions) -> float:

@@ -20,6 +20,7 @@ from groma.execution import map_in_threads
 from groma.gates import gate
 from groma.localization.features import Bytes, unit
 from groma.localization.matching import Vectors, alike_elsewhere
+from groma.localization.pose.gates import VERDICT
 
 
 @dataclass(frozen=True)
@@ -32,9 +33,6 @@ class RepeatedGates:
     sample: int = gate(20_000, "pairs", "of descriptors that this is computed from", "cost: 20 ms")
     images: int = gate(
         8, "images", "the most alike, that each is compared with", "convention: as many as a query is matched with"
-    )
-    cells: int = gate(
-        32, "cells", "per longer side: farther than one away is another place", "derived from the reach of a descriptor"
     )
 
 
@@ -93,7 +91,7 @@ def unique_points(
                 rows, columns = described.upright[left] == upright, there.upright == upright
                 vectors = unit(described.descriptor[left[rows]]), unit(there.descriptor[columns])
                 far = alike_elsewhere(
-                    vectors[0], places[rows], vectors[1], there.pixel[columns], sides[other] / GATES.cells
+                    vectors[0], places[rows], vectors[1], there.pixel[columns], sides[other] / VERDICT.cells
                 )
                 nearest[left[rows] - own.start] = np.minimum(nearest[left[rows] - own.start], far)
         return nearest

@@ -19,7 +19,7 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.features.depth.noise import DepthNoise
-from groma.gates import gate
+from groma.gates import NORMAL, gate
 from groma.mapping.depth.unit import ROBUST
 
 
@@ -36,9 +36,6 @@ class MapNoiseGates:
     )
     least: float = gate(1e-4, "share", "of the depth: no depth is known better", "derived from 16-bit files")
     cells: int = gate(6, "cells", "along the width of an image, in which errors are alike", "cost: 36 in a square")
-    mistake: float = gate(
-        4.0, "sigma", "differences beyond are mistakes", "derived from normal noise: exceeded once in 16 000"
-    )
     correlation: float = gate(
         6.0, "samples", "neighbouring pixels that err alike count as one", "chosen on cabinet, redkitchen"
     )
@@ -89,7 +86,7 @@ def fitted_noise(depth: FloatArray, difference: FloatArray, sigma: FloatArray) -
 
 def shared_errors(whitened: FloatArray, image_idx: IntArray, cell: IntArray) -> SharedErrors:
     """Return the correlations of whitened differences (N,), by products of all pairs in a cell, and in an image."""
-    good = np.abs(whitened) < NOISE.mistake
+    good = np.abs(whitened) < NORMAL.mistake
     values, image, cell = whitened[good], image_idx[good], cell[good]
     if len(values) < NOISE.min_points:
         return SharedErrors()

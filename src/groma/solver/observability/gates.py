@@ -38,9 +38,6 @@ class DiagnosisGates:
     near_one_place: float = gate(0.03, "viewing distances", "and hardly move, if most landmarks suffer", _CLASSES)
     parallax: float = gate(math.radians(3.0), "rad", "angle of rays that determine a point", _CLASSES)
     small_parallax: float = gate(math.radians(0.3), "rad", "the same if its residuals say so", _CLASSES)
-    discounted: float = gate(
-        5.0, "sigma", "a residual beyond: not for want of parallax", "derived from normal noise: 1 in 10^6"
-    )
     along: float = gate(math.radians(5.0), "rad", "a line runs along a motion; planes through it are one", _CLASSES)
     end_on: float = gate(math.radians(0.5), "rad", "a ray sees a line end-on", _CLASSES)
     flat: float = gate(1e-3, "share", "least extent of points on one plane, of the next", _CLASSES)
