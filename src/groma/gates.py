@@ -32,6 +32,10 @@ from typing import Any
 
 #: How the origin of a number may begin.
 ORIGINS = ("derived from", "chosen on", "convention:", "cost:")
+#: Origins that many numbers share: the data that they were chosen on.
+LINE_MAPS, STRUCTURE = "chosen on benchmarks/lines.py", "chosen on benchmarks/structure.py"
+SURVEYED = "chosen on benchmarks/surveyed.py"
+STRECHA, KINECT = "chosen on Strecha's scenes", "chosen on Kinect images"
 
 
 def gate(default: Any, unit: str, meaning: str, origin: str) -> Any:

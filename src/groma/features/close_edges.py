@@ -42,9 +42,7 @@ class CloseEdgeGates:
         "standard deviation of its logarithm",
         "chosen on halved photographs of Strecha's scenes; with 0.15 to 0.6 places are up to a quarter worse",
     )
-    any_spread: float = gate(
-        1.0, "1", "the same for an edge that is alone, shadows too", "derived from 0.3 to 2 pixels"
-    )
+    any_spread: float = gate(1.0, "1", "the same for an edge alone, shadows too", "derived from 0.3 to 2 pixels")
     noise: float = gate(2.0, "grey levels", "noise of a pixel", "convention: a photograph of 8 bits in good light")
     model: float = gate(
         0.02,
@@ -53,10 +51,7 @@ class CloseEdgeGates:
         "chosen on rendered edges; with 0.005 to 0.04 places in halved photographs are up to a quarter worse",
     )
     close: float = gate(
-        2.0,
-        "px",
-        "from a step to the pixels that one step is fitted to",
-        "chosen on halved photographs of Strecha's scenes; with 2.5 places are up to a quarter worse, with 1.5 much",
+        2.0, "px", "from a step to its pixels", "chosen on halved photographs of Strecha: 1.5 and 2.5 are worse"
     )
     displacement: float = gate(
         0.35, "px", "by which neighbours still displace one step", "derived from edges one to three pixels apart"
@@ -170,14 +165,15 @@ class _Profiles:
         """Segments that two steps explain, given the costs of one; offset and tilt of the own step, and variances."""
         gates, weight, log_blur = self.gates, self._weight(self.whole), math.log(self.gates.blur)
         # No second step could gain more than all that is left.
-        evidence = chi_square_gate(gates.chance, 3)  # three unknowns more
+        # A step has three unknowns; twelve bins less two steps leave six.
+        evidence, misfit = chi_square_gate(gates.chance, 3), chi_square_gate(gates.chance, 6)
         some = np.flatnonzero(alone > evidence)
         start, found = two_steps(self.whole[some], weight[some], log_blur, EDGES.max_shift)
         some = some[found]
         together = fit(self.whole[some], weight[some], start[found], log_blur, gates.blur_spread)
         used = np.count_nonzero(self.whole[some, :, 0], axis=1)
         scale = np.maximum(together.cost / np.maximum(used - 6, 1), 1.0)
-        told = (together.cost <= chi_square_gate(gates.chance, 6)) & (alone[some] - together.cost > evidence * scale)
+        told = (together.cost <= misfit) & (alone[some] - together.cost > evidence * scale)
         some, scale = some[told], scale[told]
         both = fit(
             self.halves[some], self._weight(self.halves)[some], together.states[told], log_blur, gates.blur_spread

@@ -27,13 +27,9 @@ from groma.localization.pose.gates import VERDICT
 class RepeatedGates:
     """When two places look alike."""
 
-    alike: float = gate(
-        0.95, "quantile", "of the distances of descriptors of one point: as near ones look alike", "convention: 95 %"
-    )
+    alike: float = gate(0.95, "quantile", "of distances of one point: nearer ones look alike", "convention: 95 %")
     sample: int = gate(20_000, "pairs", "of descriptors that this is computed from", "cost: 20 ms")
-    images: int = gate(
-        8, "images", "the most alike, that each is compared with", "convention: as many as a query is matched with"
-    )
+    images: int = gate(8, "images", "most alike, that each is compared with", "convention: as for a query")
 
 
 GATES = RepeatedGates()

@@ -38,12 +38,8 @@ from groma.scene import Scene
 class PointRefinementGates:
     """What no image tells of a place, and how much is held in memory."""
 
-    min_correlation: float = gate(
-        0.8, "1", "of the grey levels of two observations of a point", "convention: four fifths"
-    )
-    max_shift: float = gate(
-        1.5, "px", "correction; a patch found farther away is another one", "convention: keypoints are nearer"
-    )
+    min_correlation: float = gate(0.8, "1", "of the grey levels of two observations", "convention: four fifths")
+    max_shift: float = gate(1.5, "px", "of a patch; farther it is another one", "convention: keypoints are nearer")
     points_at_once: int = gate(100_000, "points", "whose templates are held together", "cost: a hundred megabytes")
 
 

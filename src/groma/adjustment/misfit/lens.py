@@ -48,13 +48,10 @@ class LensGates:
     """When residuals show a lens."""
 
     false_alarm: float = gate(
-        1e-6, "probability", "of rings of radial residuals that noise alone exceeds", "convention: five sigma"
+        1e-6, "probability", "of rings of residuals that are noise alone", "convention: five sigma"
     )
     share: float = gate(
-        0.1,
-        "share",
-        "of the residuals' variance explained by more unknowns, above which a warning says so",
-        "convention: a tenth",
+        0.1, "share", "of the residuals' variance, above which a warning says so", "convention: a tenth"
     )
     rings: int = gate(16, "rings", "of equal area around the principal point", "convention: as many as a histogram has")
     max_observations: int = gate(200_000, "observations", "that judge a lens or a rig", "cost: more tell no more")

@@ -28,9 +28,7 @@ from groma.scene.survey import Kind
 class LevelGates:
     """When directions measured in cameras fit the scene."""
 
-    apart_deg: float = gate(
-        10.0, "degrees", "by which most directions differ, for their axes to be doubted", "cost: a refused phone"
-    )
+    apart_deg: float = gate(10.0, "degrees", "by which directions differ if axes are doubted", "cost: a refused phone")
     better: float = gate(3.0, "times", "nearer with other axes, for these to be named", "cost: a wrong hint")
 
 

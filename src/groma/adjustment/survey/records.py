@@ -24,13 +24,9 @@ class ReliabilityGates:
     """The test for gross errors."""
 
     power: float = gate(0.8, "probability", "of finding an error of the size told", "convention: Baarda")
-    few: int = gate(
-        5, "coordinates", "of a kind, from which on their scatter tells its noise", "cost: whether a kind is doubted"
-    )
+    few: int = gate(5, "coordinates", "of a kind, whose scatter tells its noise", "cost: whether a kind is doubted")
     checked: float = gate(0.01, "share", "below which nothing checks a measurement", "convention: of geodesy")
-    at_once: float = gate(
-        0.5, "share", "of the largest normalised residual of a kind, for what is rejected with it", "cost: rounds"
-    )
+    at_once: float = gate(0.5, "share", "of the largest residual, for what is rejected with it", "cost: rounds")
     max_rounds: int = gate(10, "rounds", "of rejecting and accepting again", "cost: most need two")
 
 

@@ -29,9 +29,7 @@ from groma.scene import Scene, Similarity
 class SimilarityGates:
     """How a similarity to measurements is found."""
 
-    draws: int = gate(
-        500, "triples", "of correspondences tried", "derived from 1e-7 without a good one at 70 % inliers"
-    )
+    draws: int = gate(500, "triples", "of correspondences tried", "derived from 1e-7 without a good one, 70 % inliers")
     mirrored: float = gate(
         3.0, "times", "the scatter falls if the axes are mirrored: they are left-handed", "chosen on random point sets"
     )

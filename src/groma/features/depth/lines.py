@@ -27,26 +27,19 @@ from groma._typing import BoolArray, FloatArray
 from groma.errors import InputError, ShapeError
 from groma.features.depth.line_fit import CREASE, LEFT, NONE, RIGHT, SURFACE, fit_all
 from groma.features.depth.noise import DepthNoise, as_depth, as_pinhole
-from groma.gates import NORMAL, chi_square_gate, gate
+from groma.gates import KINECT, NORMAL, chi_square_gate, gate
 
 
 @dataclass(frozen=True)
 class DepthLineGates:
     """Where depth is sampled beside a segment, and what the samples must agree on."""
 
-    near: float = gate(
-        1.5, "px", "depth is sampled from this distance on", "chosen on Kinect images: edges are smeared"
-    )
+    near: float = gate(1.5, "px", "depth is sampled from this distance on", "chosen on Kinect images: smeared edges")
     far: float = gate(6.5, "px", "and up to this distance", "chosen on Kinect images")
     min_share: float = gate(0.35, "share", "share of the samples of a side on its fit", "chosen on Kinect images")
-    max_relative_sigma: float = gate(
-        0.05, "share", "noise of the depth at an end, of the depth", "chosen on Kinect images"
-    )
+    max_relative_sigma: float = gate(0.05, "share", "noise at an end, of its depth", KINECT)
     shares: tuple[float, ...] = gate(
-        (0.04, 0.015, 0.006, 0.0),
-        "share",
-        "added to it from round to round, of the inverse depth",
-        "chosen on Kinect images",
+        (0.04, 0.015, 0.006, 0.0), "share", "added to the noise round by round, of the inverse depth", KINECT
     )
     agree_share: float = gate(0.006, "share", "on top of noise, of the inverse depth", "chosen on Kinect images")
     slope_share: float = gate(0.0015, "share / px", "the same for the slope", "chosen on Kinect images")

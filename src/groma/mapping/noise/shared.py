@@ -25,7 +25,7 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.execution import map_in_threads
-from groma.gates import NORMAL, gate
+from groma.gates import NORMAL, SURVEYED, gate
 from groma.mapping.noise.landmarks import pixels_of
 from groma.scene import Scene
 
@@ -38,9 +38,7 @@ class SharedNoiseGates:
     rings: tuple[float, ...] = gate(
         (1.0, 2.0, 4.0, 8.0, 16.0), "cells", "distances at which rings of pairs end", "convention: doubling"
     )
-    min_observations: int = gate(
-        1000, "observations", "fewer tell nothing of what they share", "chosen on benchmarks/surveyed.py"
-    )
+    min_observations: int = gate(1000, "observations", "that tell what they share", SURVEYED)
     min_share: float = gate(
         0.25, "share", "of the variance of errors that residuals have at least", "derived from points of two views"
     )

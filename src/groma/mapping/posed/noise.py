@@ -28,9 +28,7 @@ from groma.gates import NORMAL, gate
 class GrossErrorGates:
     """When a given value is no measurement."""
 
-    least_redundancy: float = gate(
-        0.05, "share", "below which a residual tells nothing about the error", "convention: of geodesy"
-    )
+    least_redundancy: float = gate(0.05, "share", "below which a residual says nothing", "convention: of geodesy")
 
 
 GROSS_ERRORS = GrossErrorGates()
