@@ -17,7 +17,7 @@ from groma._typing import FloatArray
 from groma.adjustment.survey.similarity import turn_between
 from groma.adjustment.survey.triangulate import triangulated
 from groma.errors import InputError
-from groma.gates import gate
+from groma.gates import NORMAL, gate
 from groma.geometry import quaternion
 from groma.geometry.algebra import unit
 from groma.scene import Scene, Similarity
@@ -154,7 +154,7 @@ def _check_axes(
 ) -> None:
     """Refuse directions in cameras that contradict each other at the poses of the scene, turned freely or as given."""
     noise = float(np.degrees(np.median(scene.known_directions.sigma[rows])))
-    if apart <= max(GATES.apart_deg, 3.0 * noise):
+    if apart <= max(GATES.apart_deg, NORMAL.far * noise):
         return
     angles = {}
     for words, axes in _OTHER_AXES.items():
