@@ -2,8 +2,9 @@
 """Where the tuned numbers of groma are: fields of frozen dataclasses, each with its unit, meaning and origin.
 
 A class of gates stands in the file whose decisions it makes, or in ``gates.py`` of its room, and its name ends in
-``Gates``. Functions take an instance as an argument with a default, so that a number can be changed without editing
-code, and the page of thresholds in the documentation is made from the classes::
+``Gates``; levels of tests that rooms share are :class:`NormalGates`. Functions take an instance as an argument with a
+default, so that a number can be changed without editing code, and the page of thresholds in the documentation is made
+from the classes::
 
     @dataclass(frozen=True)
     class FollowingGates:
@@ -23,7 +24,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
@@ -31,6 +32,10 @@ from typing import Any
 
 #: How the origin of a number may begin.
 ORIGINS = ("derived from", "chosen on", "convention:", "cost:")
+#: Origins that many numbers share: the data that they were chosen on.
+LINE_MAPS, STRUCTURE = "chosen on benchmarks/lines.py", "chosen on benchmarks/structure.py"
+SURVEYED = "chosen on benchmarks/surveyed.py"
+STRECHA, KINECT = "chosen on Strecha's scenes", "chosen on Kinect images"
 
 
 def gate(default: Any, unit: str, meaning: str, origin: str) -> Any:
@@ -49,6 +54,21 @@ def gate(default: Any, unit: str, meaning: str, origin: str) -> Any:
         field, or a bound on *cost:* that no result depends on.
     """
     return field(default=default, metadata={"unit": unit, "meaning": meaning, "origin": origin})
+
+
+@dataclass(frozen=True)
+class NormalGates:
+    """Where what normal noise explains ends: levels that tests of all rooms share."""
+
+    far: float = gate(3.0, "sigma", "of a difference that noise seldom makes", "derived from normal noise: 1 in 370")
+    mistake: float = gate(4.0, "sigma", "of a difference that is a mistake", "derived from normal noise: 1 in 16 000")
+    sure: float = gate(5.0, "sigma", "of a difference that is stated as a fact", "convention: five sigma")
+    outlier: float = gate(3e-3, "probability", "of a residual that noise exceeds", "convention: three sigma")
+    gross: float = gate(1e-3, "probability", "of calling a good measurement wrong", "convention: Baarda")
+    false_alarm: float = gate(0.01, "probability", "of an error found where there is none", "convention: 1 in 100")
+
+
+NORMAL = NormalGates()
 
 
 def is_gate_class(value: object) -> bool:

@@ -10,7 +10,7 @@ import pytest
 import groma
 import groma.factors
 from groma.factors import Invariance, Slot, check_factor, contract, registered
-from groma.factors.checks.check import _ambients, _linearize, _residuals
+from groma.factors.checks.check import ambients_of, linearized, residuals_of
 from groma.factors.checks.world import WorldMotion, moved_world
 from groma.factors.relations.point_on_plane import PointOnPlane
 from groma.geometry import so3
@@ -31,8 +31,8 @@ def test_keeps_the_contract(name, seed):
 def move(name, motion):
     """Residuals of an example before and after a motion of the world."""
     example = registered()[name].example(np.random.default_rng(4))
-    slots, ambients = [slot for slot, _ in example.factor.references()], _ambients(example)
-    return _residuals(example.factor, ambients), _residuals(example.factor, moved_world(slots, ambients, motion))
+    slots, ambients = [slot for slot, _ in example.factor.references()], ambients_of(example)
+    return residuals_of(example.factor, ambients), residuals_of(example.factor, moved_world(slots, ambients, motion))
 
 
 #: Factors that measure in world coordinates, and those that do not mind how large the world is.
@@ -184,8 +184,8 @@ def test_check_notices_a_range_that_is_ignored():
 
 def test_records_may_be_laid_out_in_any_order():
     example = PointOnPlane.example(np.random.default_rng(0))
-    inputs = example.factor.prepare(_ambients(example))
-    expected, _ = _linearize(example.factor, _ambients(example), [3, 4])
+    inputs = example.factor.prepare(ambients_of(example))
+    expected, _ = linearized(example.factor, ambients_of(example), [3, 4])
     record = np.zeros((6, 1, 10))
     example.factor.linearize(inputs, 0, 6, (6, 1), record)
     np.testing.assert_array_equal(record[:, :, 6:9], expected[:, :, :3])

@@ -11,7 +11,7 @@ from scipy.linalg import expm, logm
 from groma.errors import ShapeError
 from groma.factors._examples import make_example, random_poses
 from groma.factors._record import poses_from_states
-from groma.factors.checks.check import _linearize, _residuals, check_factor
+from groma.factors.checks.check import check_factor, linearized, residuals_of
 from groma.factors.contract import Ref
 from groma.factors.priors.pose_between import PoseBetween
 from groma.factors.priors.pose_prior import PosePrior
@@ -54,10 +54,10 @@ def test_pose_prior_is_the_twist_that_was_applied(rng):
     prior = random_poses(rng, N, rotation=2.0)
     xi = rng.normal(size=(N, 6))
     moved = np.array([expm(hat(x)) @ T for x, T in zip(xi, matrices(prior), strict=True)])
-    r = _residuals(PosePrior(pose=EACH, cam_from_world=prior), (flat(moved),))
+    r = residuals_of(PosePrior(pose=EACH, cam_from_world=prior), (flat(moved),))
     np.testing.assert_allclose(r, xi, rtol=1e-11, atol=1e-12)
     np.testing.assert_allclose(
-        _residuals(PosePrior(pose=EACH, cam_from_world=prior), (poses_from_states(prior),)), 0.0, atol=1e-14
+        residuals_of(PosePrior(pose=EACH, cam_from_world=prior), (poses_from_states(prior),)), 0.0, atol=1e-14
     )
 
 
@@ -68,7 +68,7 @@ def test_logarithm_and_jacobian_are_precise_at_every_angle(angle, rng):
     xi = np.hstack([rng.normal(size=(N, 3)), angle * axes / np.linalg.norm(axes, axis=1, keepdims=True)])
     identity = np.tile([0, 0, 0, 1.0, 0, 0, 0], (N, 1))
     ambient = flat(np.array([expm(hat(x)) for x in xi]))
-    record, _ = _linearize(PosePrior(pose=EACH, cam_from_world=identity), (ambient,), [6])
+    record, _ = linearized(PosePrior(pose=EACH, cam_from_world=identity), (ambient,), [6])
     np.testing.assert_allclose(record[:, :, 6], xi, rtol=1e-8, atol=1e-13 + 1e-14 / max(np.pi - angle, 1e-3))
     for x, J in zip(xi, record[:, :, :6], strict=True):
         W, P = hat(x)[:3, :3], hat(np.r_[0, 0, 0, x[:3]])[:3, :3]
@@ -84,7 +84,7 @@ def test_pose_prior_survives_a_rotation_by_pi(rng):
     identity = np.tile([0, 0, 0, 1.0, 0, 0, 0], (N, 1))
     axes = np.vstack([np.eye(3), rng.normal(size=(3, 3))])
     q = np.hstack([axes / np.linalg.norm(axes, axis=1, keepdims=True), np.zeros((N, 1)), rng.normal(size=(N, 3))])
-    record, _ = _linearize(PosePrior(pose=EACH, cam_from_world=identity), (poses_from_states(q),), [6])
+    record, _ = linearized(PosePrior(pose=EACH, cam_from_world=identity), (poses_from_states(q),), [6])
     assert np.isfinite(record).all()
     np.testing.assert_allclose(np.linalg.norm(record[:, 3:, 6], axis=1), np.pi, rtol=1e-12)
 
@@ -96,9 +96,9 @@ def test_pose_between_lives_in_the_frame_of_the_second_camera(rng):
     # first_from_second = measured Exp(xi): the error acts first, on coordinates of the second camera.
     measured = np.array([a @ np.linalg.inv(b) @ expm(-hat(x)) for a, b, x in zip(T1, T2, xi, strict=True)])
     factor = PoseBetween(first=EACH, second=Ref("others", np.arange(N)), first_from_second=se3.from_matrix(measured))
-    np.testing.assert_allclose(_residuals(factor, (flat(T1), flat(T2))), xi, atol=1e-12)
+    np.testing.assert_allclose(residuals_of(factor, (flat(T1), flat(T2))), xi, atol=1e-12)
     expected = vee(logm(np.linalg.inv(measured[0]) @ T1[0] @ np.linalg.inv(T2[0])).real)
-    np.testing.assert_allclose(_residuals(factor, (flat(T1), flat(T2)))[0], expected, atol=1e-10)
+    np.testing.assert_allclose(residuals_of(factor, (flat(T1), flat(T2)))[0], expected, atol=1e-10)
 
 
 def test_pose_between_does_not_feel_the_world_move(rng):
@@ -108,14 +108,14 @@ def test_pose_between_does_not_feel_the_world_move(rng):
     T1, T2 = matrices(random_poses(rng, N, rotation=0.5)), matrices(random_poses(rng, N, rotation=0.5))
     S = matrices(random_poses(rng, 1, rotation=2.0))
     np.testing.assert_allclose(
-        _residuals(factor, (flat(T1), flat(T2))), _residuals(factor, (flat(T1 @ S), flat(T2 @ S))), atol=1e-12
+        residuals_of(factor, (flat(T1), flat(T2))), residuals_of(factor, (flat(T1 @ S), flat(T2 @ S))), atol=1e-12
     )
 
 
 def test_position_prior_is_the_error_of_the_centre(rng):
     poses, centers = random_poses(rng, N, rotation=2.0), rng.normal(size=(N, 3))
     truth = np.linalg.inv(matrices(poses))[:, :3, 3]
-    r = _residuals(PositionPrior(pose=EACH, cam_center_in_world=centers), (poses_from_states(poses),))
+    r = residuals_of(PositionPrior(pose=EACH, cam_center_in_world=centers), (poses_from_states(poses),))
     np.testing.assert_allclose(r, truth - centers, atol=1e-13)
 
 
@@ -124,7 +124,7 @@ def test_vector_prior_takes_any_size(rng):
         x, measured = rng.normal(size=(2, N, size))
         factor = VectorPrior(variable=EACH, measured=measured)
         assert factor.residual_size == size
-        record, _ = _linearize(factor, (x,), [size])
+        record, _ = linearized(factor, (x,), [size])
         np.testing.assert_array_equal(record[:, :, -1], x - measured)
         np.testing.assert_array_equal(record[:, :, :size], np.tile(np.eye(size), (N, 1, 1)))
 
@@ -132,12 +132,12 @@ def test_vector_prior_takes_any_size(rng):
 def test_vector_prior_of_some_coordinates(rng):
     x, measured = rng.normal(size=(N, 4)), rng.normal(size=(N, 2))
     factor = VectorPrior(variable=EACH, measured=measured, coordinates=(1, 2))
-    record, _ = _linearize(factor, (x,), [4])
+    record, _ = linearized(factor, (x,), [4])
     np.testing.assert_array_equal(record[:, :, -1], x[:, 1:3] - measured)
     np.testing.assert_array_equal(record[:, :, :4], np.tile(np.eye(4)[1:3], (N, 1, 1)))
     check_factor(make_example(factor, rng, manifolds={"poses": Euclidean(4)}))
     with pytest.raises(ShapeError, match="has 2 columns, but the variables of group 'poses' have 1 numbers to know"):
-        _residuals(VectorPrior(variable=EACH, measured=measured, coordinates=(1,)), (x,))
+        residuals_of(VectorPrior(variable=EACH, measured=measured, coordinates=(1,)), (x,))
 
 
 def test_poses_far_from_their_prior_keep_their_derivative(rng):
@@ -154,7 +154,7 @@ def test_wrong_shapes_are_refused(rng):
     with pytest.raises(ShapeError, match=r"must have shape \(6, k\)"):
         VectorPrior(variable=EACH, measured=np.zeros((N + 1, 3)))
     with pytest.raises(ShapeError, match="has 2 columns, but the variables of group 'poses' have 3 numbers"):
-        _residuals(VectorPrior(variable=EACH, measured=np.zeros((N, 2))), (np.zeros((N, 3)),))
+        residuals_of(VectorPrior(variable=EACH, measured=np.zeros((N, 2))), (np.zeros((N, 3)),))
 
 
 def test_similarity_between_is_the_error_in_the_unit_of_the_second_camera(rng):
@@ -169,7 +169,7 @@ def test_similarity_between_is_the_error_in_the_unit_of_the_second_camera(rng):
     measured = sim3.from_matrix(S1 @ np.linalg.inv(S2) @ np.linalg.inv(E))
     factor = SimilarityBetween(first=EACH, second=Ref("others", np.arange(N)), first_from_second=measured)
     expected = np.hstack([E[:, :3, 3], error[:, 3:]])
-    np.testing.assert_allclose(_residuals(factor, (first, second)), expected, atol=1e-12)
+    np.testing.assert_allclose(residuals_of(factor, (first, second)), expected, atol=1e-12)
 
 
 def test_similarity_between_of_poses_is_that_of_poses_to_first_order(rng):
@@ -179,6 +179,6 @@ def test_similarity_between_of_poses_is_that_of_poses_to_first_order(rng):
     poses = PoseBetween(first=EACH, second=others, first_from_second=measured)
     one = np.ones((N, 1))
     scaled = SimilarityBetween(first=EACH, second=others, first_from_second=np.hstack([measured, one]))
-    r = _residuals(scaled, (np.hstack([first, one]), np.hstack([second, one])))
-    expected = _residuals(poses, (poses_from_states(first), poses_from_states(second)))
+    r = residuals_of(scaled, (np.hstack([first, one]), np.hstack([second, one])))
+    expected = residuals_of(poses, (poses_from_states(first), poses_from_states(second)))
     np.testing.assert_allclose(r, np.hstack([expected, 0 * one]), atol=1e-11)

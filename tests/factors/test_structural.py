@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from groma.errors import ShapeError
-from groma.factors.checks.check import _ambients, _linearize, _residuals
+from groma.factors.checks.check import ambients_of, linearized, residuals_of
 from groma.factors.contract import Ref, registered
 from groma.factors.relations.direction_pairs import (
     LineDirection,
@@ -52,8 +52,8 @@ def plane_through(p, n, scale=1.0):
 def test_point_on_line_is_the_distance(rng):
     p, d, q = rng.normal(size=(3, N, 3))
     factor = PointOnLine(point=ALL[0], line=ALL[1])
-    np.testing.assert_allclose(_residuals(factor, (p + 2.5 * d, line_through(p, d, -3.0))), 0.0, atol=1e-14)
-    r = _residuals(factor, (q, line_through(p, d, 4.0)))
+    np.testing.assert_allclose(residuals_of(factor, (p + 2.5 * d, line_through(p, d, -3.0))), 0.0, atol=1e-14)
+    r = residuals_of(factor, (q, line_through(p, d, 4.0)))
     across = (q - p) - np.sum((q - p) * unit(d), axis=1, keepdims=True) * unit(d)
     np.testing.assert_allclose(np.linalg.norm(r, axis=1), np.linalg.norm(across, axis=1), rtol=1e-12)
     np.testing.assert_allclose(np.sum(r * d, axis=1), 0.0, atol=1e-13)
@@ -61,7 +61,7 @@ def test_point_on_line_is_the_distance(rng):
 
 def test_point_on_line_has_rank_two(rng):
     p, d, q = rng.normal(size=(3, N, 3))
-    record, _ = _linearize(PointOnLine(point=ALL[0], line=ALL[1]), (q, line_through(p, d)), [3, 6])
+    record, _ = linearized(PointOnLine(point=ALL[0], line=ALL[1]), (q, line_through(p, d)), [3, 6])
     values = np.linalg.svd(record[:, :, :3], compute_uv=False)
     np.testing.assert_allclose(values, np.tile([1.0, 1.0, 0.0], (N, 1)), atol=1e-12)
 
@@ -69,7 +69,7 @@ def test_point_on_line_has_rank_two(rng):
 def test_point_on_plane_is_the_signed_distance(rng):
     p, n = rng.normal(size=(2, N, 3))
     height = rng.normal(size=(N, 1))
-    r = _residuals(PointOnPlane(point=ALL[0], plane=ALL[1]), (p + height * unit(n), plane_through(p, n, 2.2)))
+    r = residuals_of(PointOnPlane(point=ALL[0], plane=ALL[1]), (p + height * unit(n), plane_through(p, n, 2.2)))
     np.testing.assert_allclose(r, height, atol=1e-13)
 
 
@@ -82,7 +82,7 @@ def test_line_on_plane_is_zero_for_lines_in_the_plane(rng):
         LineOnPlane(line=ALL[0], plane=ALL[1], anchor=rng.normal(size=(N, 3))),
         SegmentOnPlane(line=ALL[0], plane=ALL[1], ends=rng.normal(size=(N, 2, 3))),
     ):
-        np.testing.assert_allclose(_residuals(factor, ambients), 0.0, atol=1e-13)
+        np.testing.assert_allclose(residuals_of(factor, ambients), 0.0, atol=1e-13)
 
 
 def test_line_on_plane_measures_at_the_anchor(rng):
@@ -93,13 +93,13 @@ def test_line_on_plane_measures_at_the_anchor(rng):
     def height(point):
         return np.sum((point - x) * unit(n), axis=1)
 
-    r = _residuals(SegmentOnPlane(line=ALL[0], plane=ALL[1], ends=ends), ambients)
+    r = residuals_of(SegmentOnPlane(line=ALL[0], plane=ALL[1], ends=ends), ambients)
     np.testing.assert_allclose(r, np.stack([height(p - 1.5 * d), height(p + 0.5 * d)], axis=1), rtol=1e-10)
-    r = _residuals(LineOnPlane(line=ALL[0], plane=ALL[1], anchor=ends[:, 0]), ambients)
+    r = residuals_of(LineOnPlane(line=ALL[0], plane=ALL[1], anchor=ends[:, 0]), ambients)
     np.testing.assert_allclose(r[:, 0], np.sum(unit(d) * unit(n), axis=1), rtol=1e-12)
     np.testing.assert_allclose(r[:, 1], height(p - 1.5 * d), rtol=1e-10)
     foot = np.cross(d, np.cross(p, d)) / np.sum(d * d, axis=1, keepdims=True)
-    r = _residuals(LineOnPlane(line=ALL[0], plane=ALL[1]), ambients)
+    r = residuals_of(LineOnPlane(line=ALL[0], plane=ALL[1]), ambients)
     np.testing.assert_allclose(r[:, 1], height(foot), rtol=1e-10)
 
 
@@ -108,9 +108,9 @@ def test_anchor_near_the_segment_survives_a_far_world_origin(rng):
     p = np.array([[1000.0, 0.0, 0.0]]) + rng.normal(size=(N, 3)) * [1.0, 0.0, 1.0]
     d = np.tile([1.0, 1e-3, 0.0], (N, 1))
     ambients = (line_through(p, d), plane_through(p, np.tile([0.0, 1.0, 0.0], (N, 1))))
-    assert np.abs(_residuals(LineOnPlane(line=ALL[0], plane=ALL[1]), ambients)[:, 1]).min() > 0.9
+    assert np.abs(residuals_of(LineOnPlane(line=ALL[0], plane=ALL[1]), ambients)[:, 1]).min() > 0.9
     near = LineOnPlane(line=ALL[0], plane=ALL[1], anchor=p)
-    np.testing.assert_allclose(_residuals(near, ambients)[:, 1], 0.0, atol=1e-10)
+    np.testing.assert_allclose(residuals_of(near, ambients)[:, 1], 0.0, atol=1e-10)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -130,13 +130,13 @@ def test_parallel_and_orthogonal(rng, sign):
     ]
     for cls, a, b in zero:
         np.testing.assert_allclose(
-            _residuals(cls(first=first, second=second), (a, b)), 0.0, atol=1e-14, err_msg=str(cls)
+            residuals_of(cls(first=first, second=second), (a, b)), 0.0, atol=1e-14, err_msg=str(cls)
         )
-    r = _residuals(LineDirection(line=first, direction=second), (line, sign * unit(d)))
+    r = residuals_of(LineDirection(line=first, direction=second), (line, sign * unit(d)))
     np.testing.assert_allclose(r, 0.0, atol=1e-14)
-    one = _residuals(ParallelLines(first=first, second=second), (line, skew))
+    one = residuals_of(ParallelLines(first=first, second=second), (line, skew))
     np.testing.assert_allclose(np.linalg.norm(one, axis=1), 1.0, rtol=1e-13)
-    np.testing.assert_allclose(np.abs(_residuals(OrthogonalLines(first=first, second=second), (line, other))), 1.0)
+    np.testing.assert_allclose(np.abs(residuals_of(OrthogonalLines(first=first, second=second), (line, other))), 1.0)
 
 
 @pytest.mark.parametrize("cls", STRUCTURAL, ids=lambda cls: cls.type_name)
@@ -144,11 +144,11 @@ def test_parallel_and_orthogonal(rng, sign):
 def test_scale_of_lines_and_planes_does_not_matter(cls, scale, rng):
     example = cls.example(rng)
     sizes = [example.variables[ref.group][0].factor_columns for _, ref in example.factor.references()]
-    before, _ = _linearize(example.factor, _ambients(example), sizes)
+    before, _ = linearized(example.factor, ambients_of(example), sizes)
     kinds = [slot.kind for slot in cls.slots]
     scales = [scale if kind in ("line", "plane") else 1.0 for kind in kinds]
-    scaled = tuple(a * s for a, s in zip(_ambients(example), scales, strict=True))
-    after, _ = _linearize(example.factor, scaled, sizes)
+    scaled = tuple(a * s for a, s in zip(ambients_of(example), scales, strict=True))
+    after, _ = linearized(example.factor, scaled, sizes)
     columns = np.concatenate([np.full(size, s) for size, s in zip(sizes, scales, strict=True)] + [[1.0]])
     np.testing.assert_allclose(after * columns, before, rtol=1e-9, atol=1e-12)
 
@@ -157,7 +157,7 @@ def test_objects_at_infinity_are_counted_and_zero(rng):
     p, d = rng.normal(size=(2, N, 3))
     lines = line_through(p, d)
     lines[2:4, 3:] = 0.0
-    record, degenerate = _linearize(PointOnLine(point=ALL[0], line=ALL[1]), (p, lines), [3, 6])
+    record, degenerate = linearized(PointOnLine(point=ALL[0], line=ALL[1]), (p, lines), [3, 6])
     assert degenerate == 2
     assert not record[2:4].any() and record[[0, 1, 4, 5, 6, 7], :, :9].any(axis=(1, 2)).all()
 

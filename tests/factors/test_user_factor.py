@@ -13,7 +13,7 @@ import pytest
 from groma.errors import InputError, ShapeError
 from groma.factors import contract as _factor
 from groma.factors._examples import charts
-from groma.factors.checks.check import _ambients, _linearize, _residuals, check_factor
+from groma.factors.checks.check import ambients_of, check_factor, linearized, residuals_of
 from groma.factors.contract import Example, Ref, registered
 from groma.factors.relations.point_on_plane import PointOnPlane
 from groma.factors.user import UserFactor, factor, transform
@@ -76,12 +76,12 @@ def test_agrees_with_the_same_factor_written_by_hand():
         out[0] = (plane[0] * point[0] + plane[1] * point[1] + plane[2] * point[2] + plane[3]) / n2**0.5
 
     example = PointOnPlane.example(np.random.default_rng(3))
-    theirs, _ = _linearize(example.factor, _ambients(example), [3, 4])
+    theirs, _ = linearized(example.factor, ambients_of(example), [3, 4])
     made = mine(point=example.factor.point, plane=example.factor.plane)
-    ours, degenerate = _linearize(made, _ambients(example), [3, 4])
+    ours, degenerate = linearized(made, ambients_of(example), [3, 4])
     assert degenerate == 0
     np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-14)
-    _, degenerate = _linearize(made, (_ambients(example)[0], np.zeros((3, 4))), [3, 4])
+    _, degenerate = linearized(made, (ambients_of(example)[0], np.zeros((3, 4))), [3, 4])
     assert degenerate == 6
 
 
@@ -98,9 +98,9 @@ def test_one_variable_of_free_size_and_three_variables():
             out[i] = math.sin(a[i]) * b[(i + 1) % 3] * line[3 + i] - b[i] * line[i]
 
     example = chain.example(np.random.default_rng(0))
-    record, _ = _linearize(example.factor, _ambients(example), [3, 3, 6])
+    record, _ = linearized(example.factor, ambients_of(example), [3, 3, 6])
     a, b, line = (
-        ambient[ref.index] for ambient, (_, ref) in zip(_ambients(example), example.factor.references(), strict=True)
+        ambient[ref.index] for ambient, (_, ref) in zip(ambients_of(example), example.factor.references(), strict=True)
     )
     np.testing.assert_allclose(record[:, 0, 0], np.cos(a[:, 0]) * b[:, 1] * line[:, 3], rtol=1e-8)
     np.testing.assert_allclose(record[:, 2, 6 + 2], -b[:, 2], rtol=1e-8)
@@ -115,7 +115,7 @@ def test_nan_and_forgotten_rows_are_degenerate():
 
     x = np.array([[1.0], [-1.0], [11.0], [4.0]])
     made = root(x=Ref("x", np.arange(4)), data=np.zeros((4, 1)))
-    record, degenerate = _linearize(made, (x,), [1])
+    record, degenerate = linearized(made, (x,), [1])
     assert degenerate == 2
     assert not record[1:3].any()
     np.testing.assert_allclose(record[[0, 3], 0, 1], [1.0, 2.0])
@@ -131,7 +131,7 @@ def test_writing_to_the_arguments_changes_nothing():
         x[0] = 1e6
 
     x = np.ones((2, 3))
-    record, _ = _linearize(vandal(x=Ref("x", [0, 1])), (x,), [3])
+    record, _ = linearized(vandal(x=Ref("x", [0, 1])), (x,), [3])
     np.testing.assert_allclose(record[:, 0], np.tile([1.0, 2.0, 0.0, 3.0], (2, 1)), rtol=1e-9)
     np.testing.assert_array_equal(x, 1.0)
 
@@ -143,14 +143,14 @@ def test_functions_that_numba_cannot_compile_are_refused_with_a_reason():
         out[0] = float(f"{x[0]:.3f}")
 
     with pytest.raises(InputError, match=r"residual function of factor 'my_text' must be of the kind that Numba"):
-        _residuals(text(x=Ref("x", [0])), (np.ones((1, 3)),))
+        residuals_of(text(x=Ref("x", [0])), (np.ones((1, 3)),))
 
     @factor("my_comparison", slots=[("x", "point")], residual_size=1, derivative="complex")
     def comparison(data, x, out):
         out[0] = math.hypot(x[0], x[1])
 
     with pytest.raises(InputError, match=r"use derivative='central' if it cannot"):
-        _residuals(comparison(x=Ref("x", [0])), (np.ones((1, 3)),))
+        residuals_of(comparison(x=Ref("x", [0])), (np.ones((1, 3)),))
 
 
 def test_declarations_are_checked():
@@ -186,7 +186,7 @@ def test_declarations_are_checked():
 PROGRAM = """
 import numpy as np
 from groma._kernels.cache import counts
-from groma.factors.checks.check import _ambients, _block_sizes, _linearize, _residuals
+from groma.factors.checks.check import ambients_of, block_sizes_of, linearized, residuals_of
 from groma.factors.user import factor
 
 SCALE = 2.0
@@ -202,9 +202,9 @@ def Second(data, point, out):
 before = counts.compiled
 for kind in (First, Second):
     example = kind.example(np.random.default_rng(0))
-    ambients = _ambients(example)
-    sizes = _block_sizes(example)
-    print(_residuals(example.factor, ambients)[0, 0].hex(), _linearize(example.factor, ambients, sizes)[1])
+    ambients = ambients_of(example)
+    sizes = block_sizes_of(example)
+    print(residuals_of(example.factor, ambients)[0, 0].hex(), linearized(example.factor, ambients, sizes)[1])
 print(counts.compiled - before)
 """
 

@@ -15,13 +15,14 @@ from scipy.stats import chi2
 from groma.cli.main import run
 from groma.errors import InputError
 from groma.evaluation import evaluate_poses
+from groma.gates import NORMAL
 from groma.geometry import quaternion
 from groma.io import read_scene, write_scene
 from groma.io.colmap.at_poses import MatchedPair
 from groma.mapping.posed.averaging import average_centers, average_rotations
 from groma.mapping.posed.axes import check_axes
 from groma.mapping.posed.motions import motions_of
-from groma.mapping.posed.noise import GATES, noise_of_given
+from groma.mapping.posed.noise import noise_of_given
 from groma.mapping.posed.place import averaged
 from groma.scene import Cameras, Scene
 
@@ -148,7 +149,7 @@ def test_noise_is_estimated_and_gross_errors_are_tested_for():
         noise = noise_of_given(squared, redundancy)
         alarms += bool(noise.gross.any())
         sigmas.append(noise.sigma)
-    assert alarms / 300 < 3.0 * GATES.false_alarm
+    assert alarms / 300 < 3.0 * NORMAL.false_alarm
     assert abs(np.mean(sigmas) / 0.2 - 1.0) < 0.02
     squared[[2, 7, 11]] = 4.0
     noise = noise_of_given(squared, redundancy)

@@ -15,23 +15,12 @@ is that of the same observations.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.gates import chi_square_gate, gate
-
-
-@dataclass(frozen=True)
-class FitGates:
-    """Which observations are inliers."""
-
-    outlier: float = gate(3e-3, "probability", "of a residual that noise exceeds", "convention: three sigma")
-
-
-FIT = FitGates()
+from groma.gates import NORMAL, chi_square_gate
 
 
 def noise_of(squares: FloatArray, redundancy: FloatArray | float = 1.0) -> float:
@@ -63,7 +52,7 @@ def inliers(
     """
     found = {}
     for kind, squares in after.items():
-        limit = noise_of(squares, redundancy[kind]) ** 2 * chi_square_gate(FIT.outlier, 2)
+        limit = noise_of(squares, redundancy[kind]) ** 2 * chi_square_gate(NORMAL.outlier, 2)
         inside = (squares > 0.0) & (squares <= limit)
         if not inside.any():
             continue

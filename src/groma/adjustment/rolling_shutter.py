@@ -30,7 +30,7 @@ from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult, Progress
 from groma.adjustment.terms.readout import MOTIONS
 from groma.errors import InputError, ProblemError
-from groma.gates import chi_square_gate, gate
+from groma.gates import NORMAL, chi_square_gate, gate
 from groma.geometry import quaternion
 from groma.problem.problem import Problem
 from groma.scene import CameraMotions, Scene
@@ -50,35 +50,21 @@ AXES = {"rows": ROWS, "columns": COLUMNS}
 class RollingShutterGates:
     """How motions during the readout are held, and when they are told to be uncertain."""
 
-    turn: float = gate(
-        np.radians(3.0), "rad", "standard deviation of a turn at the start", "convention: 100 degrees in a second"
-    )
-    shift: float = gate(
-        0.3, "times", "the distance to the nearest other camera, of a shift at the start", "convention: a third"
-    )
+    turn: float = gate(np.radians(3.0), "rad", "deviation of a turn at the start", "convention: 100 degrees a second")
+    shift: float = gate(0.3, "times", "distance to the nearest camera, of a shift at the start", "convention: a third")
     smallest: float = gate(
         1e-3, "times", "the standard deviation at the start, below which none falls", "cost: smaller ones hold as well"
     )
-    settled: float = gate(
-        1.15, "times", "by which standard deviations change when they have settled", "cost: 15 % of a weight"
-    )
+    settled: float = gate(1.15, "times", "by which deviations change that have settled", "cost: 15 % of a weight")
     max_rounds: int = gate(4, "adjustments", "of a scene", "cost: most need three")
     max_images: int = gate(300, "images", "for which redundancy is computed; of more it is taken as one", "cost: time")
-    false_alarm: float = gate(
-        1e-3, "probability", "of a sequence where there is none", "convention: three sigma on one side"
-    )
     parallel: float = gate(
-        np.radians(30.0),
-        "rad",
-        "between the directions of readout of two images, below which all count as parallel",
-        "convention: half of what would decide",
+        np.radians(30.0), "rad", "between directions of readout that are parallel", "convention: half of what decides"
     )
     explained: float = gate(
         0.1, "share", "of the residuals' variance that motions explain, or they are left out", "convention: a tenth"
     )
-    determined: float = gate(
-        0.5, "share", "of a motion that the images determine, below which a warning says so", "convention: half"
-    )
+    determined: float = gate(0.5, "share", "of a motion that images determine, else a warning", "convention: half")
 
 
 GATES = RollingShutterGates()
@@ -307,7 +293,7 @@ def _share(free: FloatArray, known: FloatArray, between: FloatArray, sigma: Floa
         w, v, d = known[:, part], free[:, part], between[:, part]
         nothing, something = ((w * (v - factor * d) ** 2).sum() for factor in (0.0, share))
         gain += v.size * float(np.log(max(nothing, 1e-300) / max(something, 1e-300)))
-    return share if gain > chi_square_gate(GATES.false_alarm, 1) else 0.0
+    return share if gain > chi_square_gate(NORMAL.gross, 1) else 0.0
 
 
 def _spread(scene: Scene, table: CameraMotions) -> float:

@@ -38,9 +38,8 @@ class StageGates:
         0.3, "share", "the same for plain least squares before lines are restarted", "cost: steps of lines gone astray"
     )
     metric_start: float = gate(
-        1e-3, "share", "a tracked scene stays as it is if the first step promises less",
-        "derived from where tracking ends, far below the noise of measurements",
-    )  # fmt: skip
+        1e-3, "share", "a tracked scene stays if a step promises less", "derived from where tracking ends"
+    )
     given_up: float = gate(
         0.05, "share", "of full weight; a relation with less was given up", "convention: of outliers of an M-estimator"
     )

@@ -20,9 +20,7 @@ class ReadingGates:
     """What a file may ask for. Beyond these it is taken for one that was made to harm."""
 
     free: int = gate(32 << 20, "bytes", "to which any compressed file may expand", "cost: memory")
-    ratio: int = gate(
-        40, "1", "and so many times its size on top", "cost: memory; numbers as text shrink by 3 to 6, arrays by 16"
-    )
+    ratio: int = gate(40, "1", "and so many times its size", "cost: memory; text shrinks by 3 to 6, arrays by 16")
     pipe: int = gate(256 << 20, "bytes", "largest content of what is no regular file, such as a pipe", "cost: memory")
     line: int = gate(1 << 20, "characters", "longest line of a text file of numbers", "cost: memory and time")
     pixels: int = gate(1 << 24, "px", "largest image of any file", "cost: memory")

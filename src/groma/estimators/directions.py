@@ -43,28 +43,16 @@ class DirectionGates:
     max_candidates: int = gate(512, "directions", "candidates of one round", "cost: time of a search")
     max_scored: int = gate(4096, "features", "features that score them", "cost: time of a search")
     max_refined: int = gate(3, "directions", "best candidates that are refined", "cost: time of a search")
-    min_sine: float = gate(
-        0.02, "rad", "angle of two normals that make a candidate", "derived from noise of 0.05 degrees"
-    )
-    taken: float = gate(
-        0.9999, "probability", "features out to this quantile are taken out with a direction",
-        "derived from noise: what is left must not repeat it",
-    )  # fmt: skip
-    wider: float = gate(
-        4.0, "1", "factor of the squared gate in the refinement: twice as far", "chosen on synthetic rooms"
-    )
+    min_sine: float = gate(0.02, "rad", "of two normals that make a candidate", "derived from noise of 0.05 degrees")
+    taken: float = gate(0.9999, "probability", "within which features go with a direction", "derived from noise")
+    wider: float = gate(4.0, "1", "factor of the squared gate in the refinement", "chosen on synthetic rooms")
     max_move: float = gate(0.05, "rad", "longest step of the refinement", "derived from linearity")
-    same: float = gate(
-        3.0, "parallel sigmas", "directions nearer to each other are one", "derived from normal noise: 1 in 370"
-    )
+    same: float = gate(3.0, "parallel sigmas", "nearer directions are one", "derived from normal noise: 1 in 370")
     orthogonal_sigma: float = gate(
-        2.6e-3, "rad", "how orthogonal things are that are meant to be",
-        "derived from three times how parallel they are: 0.15 degrees",
-    )  # fmt: skip
-    orthogonal_level: float = gate(0.95, "probability", "level of the test of a right angle", "convention: 95 %")
-    max_orthogonal_sigma: float = gate(
-        0.01, "rad", "right angles less certain say nothing", "chosen on synthetic rooms"
+        2.6e-3, "rad", "of right angles", "derived from parallel ones, times three: 0.15 degrees"
     )
+    orthogonal_level: float = gate(0.95, "probability", "level of the test of a right angle", "convention: 95 %")
+    max_orthogonal_sigma: float = gate(0.01, "rad", "of right angles that tell something", "chosen on synthetic rooms")
 
 
 #: The numbers in use.

@@ -22,7 +22,7 @@ from groma._ordering import ascending, median
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.batch_least_squares import PROBLEMS_AT_ONCE
 from groma.execution import map_ranges
-from groma.gates import gate, numbers
+from groma.gates import STRECHA, gate, numbers
 from groma.geometry.incidence import MIN_SINE
 
 
@@ -31,12 +31,8 @@ class LineEndGates:
     """Where a line ends, by where its segments end."""
 
     same_end: float = gate(5.0, "px", "ends so near to each other are the same end", "chosen on Strecha's scenes")
-    majority: float = gate(
-        3.0, "ratio", "images that end at a place, to those that go on", "chosen on Strecha's scenes"
-    )
-    quantile: float = gate(
-        1 / 3, "share", "of the weight of its segments that lies beyond an end", "chosen on Strecha's scenes"
-    )
+    majority: float = gate(3.0, "ratio", "images that end at a place, over those that go on", STRECHA)
+    quantile: float = gate(1 / 3, "share", "of the weight of segments, beyond an end", STRECHA)
 
 
 #: The defaults.

@@ -62,12 +62,7 @@ __all__ = [
 class TriangulationGates:
     """Lines from planes."""
 
-    min_sine: float = gate(
-        0.05,
-        "1",
-        "sine of the angle of two planes that tells a line: 3 degrees",
-        "derived from noise: its error grows 20 times",
-    )
+    min_sine: float = gate(0.05, "1", "of the angle of two planes", "derived from noise: 20 times as large")
 
 
 #: The defaults.

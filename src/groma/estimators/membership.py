@@ -34,9 +34,7 @@ class MembershipGates:
     """How deviations and shares are estimated."""
 
     rounds: int = gate(30, "rounds", "of expectation and maximisation", "cost: converges in fewer")
-    pooled: float = gate(
-        4.0, "features", "that the share of all counts in that of each", "chosen on walls full of points"
-    )
+    pooled: float = gate(4.0, "features", "that the overall share counts in each", "chosen on walls full of points")
     tried: int = gate(12, "deviations", "that are tried", "cost: each two fifths larger than the one before")
     least: float = gate(0.02, "share", "of the largest deviation, the least that is tried", "cost: tells from none")
     significance: float = gate(0.05, "probability", "to find a deviation where there is none", "convention: 5 %")

@@ -32,12 +32,7 @@ from groma.geometry.algebra import cofactor, dot, matrices, norm, not_negative, 
 class TrimGates:
     """Ends of lines."""
 
-    min_sine: float = gate(
-        0.02,
-        "1",
-        "sine of the angle between line and ray that tells an end",
-        "derived from noise: its error grows 50 times",
-    )
+    min_sine: float = gate(0.02, "1", "of the angle of line and ray", "derived from noise: 50 times as large")
 
 
 #: The defaults.

@@ -19,34 +19,22 @@ class ScoreGates:
         (0.001, 0.005, 0.01), "share", "thresholds of line scores, of the reference's extent, where none are given",
         "convention: LIMAP gives 1, 5 and 10 mm in rooms of a metre and more",
     )  # fmt: skip
-    strict_share: float = gate(
-        0.9, "share", "part of a line that is near, for the strict precision", "convention: nearly all"
-    )
-    found_share: float = gate(
-        0.5, "share", "part of a segment that is near, for the recall by count", "convention: half"
-    )
+    strict_share: float = gate(0.9, "share", "of a line that is near, for strict precision", "convention: nearly all")
+    found_share: float = gate(0.5, "share", "of a segment that is near, for the recall by count", "convention: half")
     max_anchors: int = gate(200_000, "places", "places on a reference that distances are sought from", "cost: memory")
     max_places: int = gate(1000, "places", "places on one segment", "cost: memory")
     plane_angle_deg: float = gate(10.0, "deg", "angle of planes that are the same", "convention: of plane benchmarks")
-    plane_share: float = gate(
-        0.01, "share", "offset of planes that are the same, of the extent", "convention: as for lines"
-    )
+    plane_share: float = gate(0.01, "share", "offset of the same plane, of the extent", "convention: as for lines")
     pose_angles_deg: tuple[float, ...] = gate(
         (1.0, 3.0, 5.0, 10.0), "deg", "thresholds of the area under the curve", "convention: image matching benchmarks"
     )
     time_difference: float = gate(0.01, "s", "times of poses that belong together", "convention: half of TUM's 0.02 s")
     associated: float = gate(0.5, "share", "less of the shorter side in both is warned of", "convention: half")
     but_for_scale: float = gate(
-        0.25,
-        "share",
-        "of the position error that remains with a free scale, below which a message says so",
-        "convention: fifteen sixteenths of a sum of squares",
+        0.25, "share", "of the error left by a free scale, to be told", "convention: 15/16 of squares"
     )
     unrelated_deg: float = gate(
-        60.0,
-        "deg",
-        "mean angle left by the alignment that is warned of",
-        "derived from the angle of random rotations: half of it",
+        60.0, "deg", "mean angle after alignment, to be warned of", "derived from random rotations: half"
     )
     segment_lengths: tuple[float, ...] = gate(
         (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0), "m", "lengths of the segments of a drift", _KITTI
@@ -59,9 +47,8 @@ class AlignmentGates:
     """When camera centres determine a rotation."""
 
     known_rotation: float = gate(
-        math.radians(1.0), "rad", "noise of a rotation known from centres; above it orientations may take part",
-        "convention: as for weak directions of a tracked pose",
-    )  # fmt: skip
+        math.radians(1.0), "rad", "noise of rotations known from centres", "convention: one degree"
+    )
 
 
 #: The numbers in use.

@@ -28,7 +28,7 @@ from groma.features.edge_fit import EDGES
 from groma.features.images import GrayImage, to_gray
 from groma.features.segments import Segments
 from groma.features.steps import beside, fit, profiles, two_steps
-from groma.gates import gate
+from groma.gates import chi_square_gate, gate
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,7 @@ class CloseEdgeGates:
         "standard deviation of its logarithm",
         "chosen on halved photographs of Strecha's scenes; with 0.15 to 0.6 places are up to a quarter worse",
     )
-    any_spread: float = gate(
-        1.0, "1", "the same for an edge that is alone, shadows too", "derived from 0.3 to 2 pixels"
-    )
+    any_spread: float = gate(1.0, "1", "the same for an edge alone, shadows too", "derived from 0.3 to 2 pixels")
     noise: float = gate(2.0, "grey levels", "noise of a pixel", "convention: a photograph of 8 bits in good light")
     model: float = gate(
         0.02,
@@ -53,27 +51,12 @@ class CloseEdgeGates:
         "chosen on rendered edges; with 0.005 to 0.04 places in halved photographs are up to a quarter worse",
     )
     close: float = gate(
-        2.0,
-        "px",
-        "from a step to the pixels that one step is fitted to",
-        "chosen on halved photographs of Strecha's scenes; with 2.5 places are up to a quarter worse, with 1.5 much",
+        2.0, "px", "from a step to its pixels", "chosen on halved photographs of Strecha: 1.5 and 2.5 are worse"
     )
     displacement: float = gate(
         0.35, "px", "by which neighbours still displace one step", "derived from edges one to three pixels apart"
     )
-    max_shift: float = gate(1.5, "px", "of an edge from its segment", "derived from the window of the segment's fit")
-    evidence: float = gate(
-        21.1,
-        "sigma squared",
-        "twice the logarithm of the likelihood that a second step must gain",
-        "derived from three unknowns of chance: 1 in 10 000",
-    )
-    misfit: float = gate(
-        27.9,
-        "sigma squared",
-        "sum of squares of a profile that two steps explain",
-        "derived from its noise: twelve bins, six unknowns, 1 in 10 000",
-    )
+    chance: float = gate(1e-4, "probability", "that noise looks like another step", "convention: 1 in 10 000")
 
 
 #: The defaults.
@@ -140,7 +123,7 @@ def placed(
     tilt[some] = share[:, 1] * own[:, 1]
     added[rows[some]] = (1.0 - share[:, 0]) * gates.displacement**2
     away = offset[:, None] + tilt[:, None] * [-0.5, 0.5]
-    near = (np.abs(away) <= gates.max_shift).all(axis=1)
+    near = (np.abs(away) <= EDGES.max_shift).all(axis=1)
     rows, away = rows[near], away[near]
     across = np.stack([ends[rows, 1] - ends[rows, 3], ends[rows, 2] - ends[rows, 0]], axis=1) / length[rows, None]
     new_ends[rows] += (away[:, :, None] * across[:, None]).reshape(-1, 4)
@@ -174,7 +157,7 @@ class _Profiles:
         # Its tilt is that of the fitted segment: places along it vote for that one by one.
         # Less than it is known to is noise, and noise differs from view to view.
         away = np.abs(found[:, 3])
-        moved = (found[:, 2] > 0.0) & (away <= gates.max_shift) & (away > self.sigma[sharp])
+        moved = (found[:, 2] > 0.0) & (away <= EDGES.max_shift) & (away > self.sigma[sharp])
         offset[sharp] = np.where(moved, found[:, 3], 0.0)
         return offset, alone.cost
 
@@ -182,13 +165,15 @@ class _Profiles:
         """Segments that two steps explain, given the costs of one; offset and tilt of the own step, and variances."""
         gates, weight, log_blur = self.gates, self._weight(self.whole), math.log(self.gates.blur)
         # No second step could gain more than all that is left.
-        some = np.flatnonzero(alone > gates.evidence)
-        start, found = two_steps(self.whole[some], weight[some], log_blur, gates.max_shift)
+        # A step has three unknowns; twelve bins less two steps leave six.
+        evidence, misfit = chi_square_gate(gates.chance, 3), chi_square_gate(gates.chance, 6)
+        some = np.flatnonzero(alone > evidence)
+        start, found = two_steps(self.whole[some], weight[some], log_blur, EDGES.max_shift)
         some = some[found]
         together = fit(self.whole[some], weight[some], start[found], log_blur, gates.blur_spread)
         used = np.count_nonzero(self.whole[some, :, 0], axis=1)
         scale = np.maximum(together.cost / np.maximum(used - 6, 1), 1.0)
-        told = (together.cost <= gates.misfit) & (alone[some] - together.cost > gates.evidence * scale)
+        told = (together.cost <= misfit) & (alone[some] - together.cost > evidence * scale)
         some, scale = some[told], scale[told]
         both = fit(
             self.halves[some], self._weight(self.halves)[some], together.states[told], log_blur, gates.blur_spread
@@ -197,7 +182,7 @@ class _Profiles:
         covariance = np.linalg.inv(both.information + 1e-9 * np.eye(8))
         variance = scale[:, None] * np.diagonal(covariance, axis1=1, axis2=2)
         # The step that is the segment's: an ascent, high and near.
-        height = both.states[:, [2, 5]] * np.exp(-0.5 * (both.states[:, [3, 6]] / gates.max_shift) ** 2)
+        height = both.states[:, [2, 5]] * np.exp(-0.5 * (both.states[:, [3, 6]] / EDGES.max_shift) ** 2)
         at = (np.array([3, 6])[height.argmax(axis=1)])[:, None] + np.arange(2)
         return some, np.take_along_axis(both.states, at, 1), np.take_along_axis(variance, at, 1)
 

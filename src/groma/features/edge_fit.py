@@ -56,9 +56,7 @@ class EdgeGates:
     """How segments are fitted to the grey levels, and how well that makes them known."""
 
     window: float = gate(1.5, "px", "standard deviation of the window around a peak", "chosen on rendered edges")
-    max_shift: float = gate(
-        1.5, "px", "an end point that would move further keeps its place", "chosen on rendered edges"
-    )
+    max_shift: float = gate(1.5, "px", "ends that would move further keep their place", "chosen on rendered edges")
     min_sigma: float = gate(
         0.03, "px", "what no image can tell: lens model, shading", "chosen on Strecha's scenes, against their surveys"
     )
@@ -66,12 +64,8 @@ class EdgeGates:
     prior_sigma: float = gate(0.15, "px", "noise of one sample, before any is seen", "chosen on Strecha's scenes")
     prior_count: float = gate(10.0, "samples", "samples that this weighs", "chosen on Strecha's scenes")
     bow_test: float = gate(9.0, "sigma squared", "a bow counts from here", "derived from normal noise: 1 in 370")
-    outlier: float = gate(
-        4.0, "sigma", "samples farther from the line weigh nothing", "derived from Tukey's 95 % efficiency"
-    )
-    min_share: float = gate(
-        0.5, "share", "share of the samples that show an edge", "derived from the median it starts from"
-    )
+    outlier: float = gate(4.0, "sigma", "samples farther off weigh nothing", "derived from Tukey's 95 % efficiency")
+    min_share: float = gate(0.5, "share", "of the samples that show an edge", "derived from the median it starts from")
 
 
 #: The defaults.

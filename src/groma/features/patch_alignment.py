@@ -36,7 +36,7 @@ from groma._numba import inline_kernel, kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import ShapeError
 from groma.features.images import GrayImage
-from groma.gates import gate, numbers
+from groma.gates import STRECHA, gate, numbers
 from groma.geometry.algebra import as_rows
 
 RADIUS = 7  # of the template, pixels
@@ -53,12 +53,9 @@ class PatchGates:
     max_iterations: int = gate(20, "steps", "steps of an alignment", "cost: converges in fewer")
     step: float = gate(2e-3, "px", "a smaller step ends the alignment", "cost: a tenth of what it is good for")
     shape_sigma: float = gate(
-        0.1, "1", "how far a step may turn, shear and stretch the patch, against grey levels of no texture",
-        "chosen on Strecha's scenes",
-    )  # fmt: skip
-    unexplained: float = gate(
-        0.01, "share", "of the contrast squared, that no template explains", "chosen on Strecha's scenes"
+        0.1, "1", "how far a step may turn, shear and stretch the patch, against grey levels of no texture", STRECHA
     )
+    unexplained: float = gate(0.01, "share", "of the contrast squared, that no template explains", STRECHA)
     min_texture: float = gate(
         1.0, "grey levels squared", "templates with less are left alone", "derived from camera noise"
     )

@@ -21,6 +21,7 @@ from groma.execution import together
 from groma.features.contract import SegmentDetector
 from groma.features.images import GrayImage
 from groma.features.matching.descriptor import Descriptors, describe
+from groma.features.point_tracks import POINT_TRACKS
 from groma.features.registry import DETECTORS
 from groma.features.segments import Segments
 from groma.features.sift import Blobs, describe_upright, find_blobs
@@ -98,7 +99,7 @@ def find_points(image: GrayImage) -> DescribedPoints:
 
 def find_corners(image: GrayImage) -> DescribedPoints:
     """Find and describe corners, at one scale and upright: maps of sequences consist of such."""
-    found = cv2.goodFeaturesToTrack(image, FEATURES.max_corners, 0.005, FEATURES.corner_distance)
+    found = cv2.goodFeaturesToTrack(image, FEATURES.max_corners, POINT_TRACKS.quality, FEATURES.corner_distance)
     if found is None:
         return DescribedPoints.empty()
     return describe_places(image, found.reshape(-1, 2).astype(np.float64) + 0.5)[0]

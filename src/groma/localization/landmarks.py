@@ -25,9 +25,7 @@ class LandmarkGates:
 
     points: int = gate(600, "points", "of a query, the coarsest", "cost: of matching")
     corners: int = gate(200, "points", "of its corners, the strongest", "cost: of matching")
-    landmarks: int = gate(
-        6, "points", "of the map at most for each of these, those that two images see first", "cost: of matching"
-    )
+    landmarks: int = gate(6, "points", "of the map for each of these, first those of two images", "cost: of matching")
     dimensions: int = gate(48, "directions", "of descriptors", "derived from their energy: 97 to 98 %")
     sample: int = gate(20_000, "descriptors", "that the directions are computed from", "cost: 10 ms")
 

@@ -20,12 +20,8 @@ from groma.localization.pose.camera import QueryCamera
 class GuidedLineGates:
     """Which segments may show a line that a pose puts near them."""
 
-    angle: float = gate(
-        0.1, "rad", "between a segment and the image of a line", "derived from the noise of short segments"
-    )
-    overlap: float = gate(
-        0.3, "share", "of the segment, that the image of the 3D segment covers", "convention: a third"
-    )
+    angle: float = gate(0.1, "rad", "between a segment and the image of a line", "derived from short segments")
+    overlap: float = gate(0.3, "share", "of the segment, that the image of a line covers", "convention: a third")
     descriptor: float = gate(0.9, "1", "largest distance of descriptors", "convention: that of wide_baseline")
 
 

@@ -55,10 +55,7 @@ class LocalizerGates:
     """How much of a map a query is compared with."""
 
     images: int = gate(8, "images", "of the map, the most alike, matched with a query", "cost: of matching")
-    plain: int = gate(
-        50, "cells", "that agree with a pose from coarse points; where fewer do, everything is matched",
-        "convention: a vote of 50 is good to a seventh",
-    )  # fmt: skip
+    plain: int = gate(50, "cells", "that agree with a coarse pose; or all is matched", "convention: good to a seventh")
     near: int = gate(5, "images", "of those, whose points and lines are looked for near a pose", "cost: of matching")
 
 

@@ -20,22 +20,16 @@ from groma.execution import map_in_threads
 from groma.gates import gate
 from groma.localization.features import Bytes, unit
 from groma.localization.matching import Vectors, alike_elsewhere
+from groma.localization.pose.gates import VERDICT
 
 
 @dataclass(frozen=True)
 class RepeatedGates:
     """When two places look alike."""
 
-    alike: float = gate(
-        0.95, "quantile", "of the distances of descriptors of one point: as near ones look alike", "convention: 95 %"
-    )
+    alike: float = gate(0.95, "quantile", "of distances of one point: nearer ones look alike", "convention: 95 %")
     sample: int = gate(20_000, "pairs", "of descriptors that this is computed from", "cost: 20 ms")
-    images: int = gate(
-        8, "images", "the most alike, that each is compared with", "convention: as many as a query is matched with"
-    )
-    cells: int = gate(
-        32, "cells", "per longer side: farther than one away is another place", "derived from the reach of a descriptor"
-    )
+    images: int = gate(8, "images", "most alike, that each is compared with", "convention: as for a query")
 
 
 GATES = RepeatedGates()
@@ -93,7 +87,7 @@ def unique_points(
                 rows, columns = described.upright[left] == upright, there.upright == upright
                 vectors = unit(described.descriptor[left[rows]]), unit(there.descriptor[columns])
                 far = alike_elsewhere(
-                    vectors[0], places[rows], vectors[1], there.pixel[columns], sides[other] / GATES.cells
+                    vectors[0], places[rows], vectors[1], there.pixel[columns], sides[other] / VERDICT.cells
                 )
                 nearest[left[rows] - own.start] = np.minimum(nearest[left[rows] - own.start], far)
         return nearest

@@ -23,7 +23,7 @@ from groma.adjustment.stages import with_loss
 from groma.factors.contract import Factor
 from groma.factors.losses import Cauchy
 from groma.features.matching.wide_baseline import fundamental_from_poses
-from groma.gates import chi_square_gate, gate
+from groma.gates import NORMAL, chi_square_gate, gate
 from groma.geometry import quaternion, se3
 from groma.localization.features import DescribedPoints, unit
 from groma.localization.matching import match_descriptors
@@ -39,7 +39,6 @@ class TriangulationGates:
     """Which features become points of the map."""
 
     beam: float = gate(4.0, "sigma", "distance from an epipolar line", "derived from noise, and as much from the poses")
-    outlier: float = gate(3e-3, "probability", "of a residual that noise exceeds", "convention: three sigma")
     depth: float = gate(0.2, "share", "of its distance: largest standard deviation of a point", "convention: a fifth")
 
 
@@ -163,7 +162,7 @@ def _points(scene: Scene, seen: _Observed, straight: FloatArray, count: int) -> 
         squares[order] = residual_squares(problem, "points", len(order))
         scale = noise_of(squares) ** 2
         covariance = landmark_covariances(problem, "points", len(xyz)) * scale
-        agrees = (squares > 0.0) & (squares <= chi_square_gate(GATES.outlier, 2) * scale)
+        agrees = (squares > 0.0) & (squares <= chi_square_gate(NORMAL.outlier, 2) * scale)
         seen = seen.take(agrees)
     return replace(_well_determined(scene, seen, xyz, covariance, count), noise=float(np.sqrt(scale)))
 

@@ -38,7 +38,7 @@ from groma.features.external import ExternalMatches
 from groma.features.matches import LineMatches
 from groma.features.registry import DETECTORS
 from groma.features.segments import Segments
-from groma.gates import gate
+from groma.gates import SURVEYED, gate
 from groma.io.depth_maps import DepthMaps
 from groma.mapping.carried.measured import (
     carried_depths,
@@ -78,18 +78,14 @@ class MappingGates:
     """How noise becomes weight, and when lines are mapped again."""
 
     loss_scale: float = gate(
-        6.0, "sigma", "scale of the first loss: matches have a narrow core and heavy tails",
-        "chosen on benchmarks/surveyed.py",
-    )  # fmt: skip
+        6.0, "sigma", "scale of the first loss: matches have a narrow core and heavy tails", SURVEYED
+    )
     last_loss_scale: float = gate(
         4.0, "sigma", "scale of the Cauchy loss of the last adjustment, relative to the noise of each point",
         "derived from Student's distribution that fits these residuals best, which bends at 4 to 5",
     )  # fmt: skip
     moved_share: float = gate(
-        0.1,
-        "share",
-        "of the points that moved by more than the lines allow for: lines are mapped again",
-        "chosen on benchmarks/surveyed.py",
+        0.1, "share", "of the points that moved by more than the lines allow for: lines are mapped again", SURVEYED
     )
     max_rounds: int = gate(4, "rounds", "of adjusting and mapping lines again", "cost: most maps need one")
 

@@ -24,6 +24,7 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
 from groma.execution import map_work
+from groma.features.edge_fit import EDGES
 from groma.features.images import GrayImage
 from groma.features.patch_alignment import SIZE, Alignment, Templates, align_templates, cut_templates, smoothed
 from groma.gates import gate
@@ -37,18 +38,8 @@ from groma.scene import Scene
 class PointRefinementGates:
     """What no image tells of a place, and how much is held in memory."""
 
-    sigma_floor: float = gate(
-        0.03,
-        "px",
-        "deviation that lens model, shading and surfaces that are not flat leave",
-        "chosen on benchmarks/surveyed.py",
-    )
-    min_correlation: float = gate(
-        0.8, "1", "of the grey levels of two observations of a point", "convention: four fifths"
-    )
-    max_shift: float = gate(
-        1.5, "px", "correction; a patch found farther away is another one", "convention: keypoints are nearer"
-    )
+    min_correlation: float = gate(0.8, "1", "of the grey levels of two observations", "convention: four fifths")
+    max_shift: float = gate(1.5, "px", "of a patch; farther it is another one", "convention: keypoints are nearer")
     points_at_once: int = gate(100_000, "points", "whose templates are held together", "cost: a hundred megabytes")
 
 
@@ -118,7 +109,7 @@ def refine_points(
     for k, points in enumerate(chunks):
         templates = search.templates(points, step(2 * k))
         for rows, found in search.places(points, templates, step(2 * k + 1)):
-            spread = np.sqrt(0.5 * np.trace(found.covariance, axis1=1, axis2=2) + GATES.sigma_floor**2)
+            spread = np.sqrt(0.5 * np.trace(found.covariance, axis1=1, axis2=2) + EDGES.min_sigma**2)
             good = found.found & (found.correlation >= GATES.min_correlation) & (spread < sigma_px)
             good &= norm(found.pixels - table.pixel[rows]) <= GATES.max_shift
             pixel[rows[good]], deviation[rows[good]] = found.pixels[good], spread[good]
@@ -127,7 +118,7 @@ def refine_points(
     # What kept its place errs against the defining observation, which errs itself.
     deviation[~refined] = np.where(defined[~refined], np.sqrt(2.0) * sigma_px, sigma_px)
     is_reference &= defined
-    deviation[is_reference] = GATES.sigma_floor
+    deviation[is_reference] = EDGES.min_sigma
     usual = float(np.median(deviation)) if len(deviation) else sigma_px
     observations = table.replace(pixel=pixel, sigma=deviation / usual)
     return PointRefinement(scene.replace(point_observations=observations), refined, is_reference, usual)

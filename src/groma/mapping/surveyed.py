@@ -33,12 +33,7 @@ from groma.scene.survey import with_rejected
 class SurveyedGates:
     """When a scene is adjusted again with better weights."""
 
-    wrong: float = gate(
-        1.15,
-        "times",
-        "that the noise of the images is off, for the adjustment to be repeated",
-        "cost: 15 % of a weight",
-    )
+    wrong: float = gate(1.15, "times", "that the noise is off, for another adjustment", "cost: 15 % of a weight")
     max_rounds: int = gate(3, "adjustments", "of a scene", "cost: most need one")
 
 

@@ -31,7 +31,7 @@ class WideGates:
     """Which images are seen in several views, and how far views reach."""
 
     max_lost: float = gate(
-        0.05, "share", "of an image that one plane of twice its size would lose", "convention: one in twenty"
+        0.05, "share", "of an image that a plane of twice its size lacks", "convention: one in twenty"
     )
     overlap: float = gate(
         5.0, "deg", "by which a view reaches beyond its side of the cube", "cost: edges at a border are measured whole"

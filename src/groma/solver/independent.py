@@ -36,18 +36,8 @@ MIN_DAMPING = 1e-15
 class StretchGates:
     """When a step is tried at another length, and the damping of variables that are not coupled."""
 
-    longer: float = gate(
-        1.5,
-        "1",
-        "gain ratio from which the cost falls faster than the model says",
-        "derived from half its curvature along the step",
-    )
-    shorter: float = gate(
-        0.5,
-        "1",
-        "gain ratio below which it is more bent than the model",
-        "derived from one and a half times its curvature",
-    )
+    longer: float = gate(1.5, "1", "gain ratio from which steps get longer", "derived from half the curvature")
+    shorter: float = gate(0.5, "1", "gain ratio below which they get shorter", "derived from 1.5 times the curvature")
     most: float = gate(8.0, "times", "a step gets as long, or as short", "cost: further steps")
     lowered: float = gate(5.0, "times", "less damping after a step that helped", "cost: further steps")
 

@@ -47,10 +47,7 @@ class JackknifeGates:
     """What is believed of single landmarks."""
 
     max_leverage: float = gate(
-        0.9,
-        "share",
-        "of an error that cameras follow at most: more tells nothing",
-        "derived from an error ten times as large",
+        0.9, "share", "of an error that cameras follow", "derived from errors ten times as large"
     )
 
 

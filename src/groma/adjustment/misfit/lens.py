@@ -23,7 +23,7 @@ from functools import partial
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.adjustment.fit import FIT, noise_of
+from groma.adjustment.fit import noise_of
 from groma.adjustment.pixel_residuals import squared_length
 from groma.adjustment.terms.principal_points import is_prior
 from groma.cameras import CameraModel, in_model
@@ -31,7 +31,7 @@ from groma.cameras import model as camera_model
 from groma.execution import begin
 from groma.factors.contract import Factor, Ref
 from groma.factors.observations.point_reprojection import PointReprojection
-from groma.gates import chi_square_gate, gate
+from groma.gates import NORMAL, chi_square_gate, gate
 from groma.geometry.manifold import Euclidean
 from groma.problem.problem import Problem
 from groma.problem.residuals import Residuals, residuals_of
@@ -48,16 +48,13 @@ class LensGates:
     """When residuals show a lens."""
 
     false_alarm: float = gate(
-        1e-6, "probability", "of rings of radial residuals that noise alone exceeds", "convention: five sigma"
+        1e-6, "probability", "of rings of residuals that are noise alone", "convention: five sigma"
     )
     share: float = gate(
-        0.1,
-        "share",
-        "of the residuals' variance explained by distortion, above which a warning says so",
-        "convention: a tenth",
+        0.1, "share", "of the residuals' variance, above which a warning says so", "convention: a tenth"
     )
     rings: int = gate(16, "rings", "of equal area around the principal point", "convention: as many as a histogram has")
-    max_observations: int = gate(200_000, "observations", "that a lens is estimated from", "cost: more tell no more")
+    max_observations: int = gate(200_000, "observations", "that judge a lens or a rig", "cost: more tell no more")
     max_iterations: int = gate(4, "steps", "with free distortion", "cost: the first brings most")
 
 
@@ -146,7 +143,7 @@ def radial_field(
         params[:, list(model.principal_point_indices)] if model.principal_point_indices else np.zeros((len(params), 2))
     )
     square = squared_length(residual)
-    limit = chi_square_gate(FIT.outlier, 2) * noise_of(square) ** 2
+    limit = chi_square_gate(NORMAL.outlier, 2) * noise_of(square) ** 2
     used = np.flatnonzero((square < limit) & (square > 0.0))
     if not len(used):
         return False

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray
-from groma.adjustment.misfit.lens import median_px, of_points
+from groma.adjustment.misfit.lens import LENS, median_px, of_points
 from groma.adjustment.stages import with_loss
 from groma.factors.contract import Factor, Ref
 from groma.factors.losses import Cauchy
@@ -37,13 +37,6 @@ SENSORS, ALONE = "sensors", "sensors, each image alone"
 class RigGates:
     """When residuals show that a rig does not fit."""
 
-    share: float = gate(
-        0.1,
-        "share",
-        "of the residuals' variance explained by free cameras, above which a warning says so",
-        "convention: a tenth",
-    )
-    max_observations: int = gate(200_000, "observations", "that a rig is judged by", "cost: more tell no more")
     max_iterations: int = gate(10, "steps", "with free cameras", "cost: most need three")
 
 
@@ -67,7 +60,7 @@ def rig_that_does_not_fit(scene: Scene, problem: Problem, threads: int | None = 
         SolverOptions(max_iterations=GATES.max_iterations, threads=threads),
         scene.sensors.is_reference == 1,
     )
-    begun = with_loss(of_points(problem, GATES.max_observations), Cauchy(1.0))
+    begun = with_loss(of_points(problem, LENS.max_observations), Cauchy(1.0))
     begun = solve(begun, options).problem
     before = median_px(_seen(begun), begun)
     if not before > 0.0:
@@ -76,13 +69,13 @@ def rig_that_does_not_fit(scene: Scene, problem: Problem, threads: int | None = 
     freed = solve(_with_free_sensors(begun, reference), options).problem if sensors.is_constant else begun
     alone = solve(_with_free_images(freed, reference), options).problem
     on_rig, apart = (median_px(_seen(found), found) for found in (freed, alone))
-    if _explained(freed, alone, on_rig, apart) >= GATES.share:
+    if _explained(freed, alone, on_rig, apart) >= LENS.share:
         return (
             "The cameras are not fixed to each other, or their images were not taken at the same moments: with a pose "
             f"for each image the median residual of points would fall from {before:.2f} to {apart:.2f} px. Map without "
             "the rig."
         )
-    if _explained(begun, freed, before, on_rig) < GATES.share:
+    if _explained(begun, freed, before, on_rig) < LENS.share:
         return None
     moved = _moved(sensors.state, freed.variables[SENSORS].state)
     return (

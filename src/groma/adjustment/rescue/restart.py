@@ -28,7 +28,7 @@ from groma.estimators.line_ends import SegmentRays, trim
 from groma.estimators.line_triangulation import triangulate_planes
 from groma.estimators.trimming import TrimStatus, trim_to_ray
 from groma.factors.contract import Factor, Ref
-from groma.gates import gate
+from groma.gates import SURVEYED, gate
 from groma.geometry import line3, quaternion, segment2
 from groma.problem.problem import Problem
 from groma.problem.residuals import squared_norms
@@ -49,12 +49,7 @@ class RestartGates:
         "cost: a few right lines are started twice; some wrong minima fit hardly worse than the right one",
     )
     min_views: int = gate(3, "observations", "of a line that can be suspicious", "derived from two that fix a line")
-    elsewhere: float = gate(
-        0.02,
-        "1",
-        "distance over its length by which a line moved, if its old end points say little",
-        "chosen on benchmarks/surveyed.py",
-    )
+    elsewhere: float = gate(0.02, "1", "distance over its length by which a line moved", SURVEYED)
     max_steps: int = gate(20, "steps", "of a line on its own", "cost: most need two or three")
 
 

@@ -24,7 +24,7 @@ from groma.estimators.trimming import trim_to_ray
 from groma.factors.observations.line_bearing import LineBearing
 from groma.factors.observations.line_reprojection import LineReprojection
 from groma.factors.observations.line_unprojection import LineUnprojection
-from groma.gates import gate
+from groma.gates import SURVEYED, gate
 from groma.problem.problem import Problem
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
@@ -36,12 +36,7 @@ Observing = LineReprojection | LineBearing | LineUnprojection
 class SlipGates:
     """Which observations of a line are false."""
 
-    nearest: float = gate(
-        0.01,
-        "1",
-        "depth of a segment over the usual one of its line, below which it is false",
-        "chosen on benchmarks/surveyed.py",
-    )
+    nearest: float = gate(0.01, "1", "depth of a false segment over the usual one of its line", SURVEYED)
 
 
 GATES = SlipGates()

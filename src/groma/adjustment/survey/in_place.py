@@ -24,6 +24,7 @@ from groma.adjustment.survey.triangulate import triangulated
 from groma.adjustment.survey.units import check_lengths, check_places
 from groma.errors import InputError
 from groma.evaluation.alignment import camera_centers, pose_alignment
+from groma.gates import NORMAL
 from groma.io.survey import WorldFrame, common_frame
 from groma.scene import Scene, Similarity
 from groma.scene.survey import Kind
@@ -132,7 +133,7 @@ def _is_there(scene: Scene, fit: RobustSimilarity) -> bool:
     centers = scene.cam_centers_in_world
     moved = np.linalg.norm(fit.similarity.points(centers) - centers, axis=1)
     noise = np.hypot(fit.scatter, float(np.median(priors.sigma[:, :3])))
-    return bool(np.median(moved) <= 3.0 * noise)
+    return bool(np.median(moved) <= NORMAL.far * noise)
 
 
 def _check_exchanged(scene: Scene, survey: Survey, source: FloatArray, fit: RobustSimilarity | None) -> None:

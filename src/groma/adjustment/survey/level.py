@@ -17,7 +17,7 @@ from groma._typing import FloatArray
 from groma.adjustment.survey.similarity import turn_between
 from groma.adjustment.survey.triangulate import triangulated
 from groma.errors import InputError
-from groma.gates import gate
+from groma.gates import NORMAL, gate
 from groma.geometry import quaternion
 from groma.geometry.algebra import unit
 from groma.scene import Scene, Similarity
@@ -28,9 +28,7 @@ from groma.scene.survey import Kind
 class LevelGates:
     """When directions measured in cameras fit the scene."""
 
-    apart_deg: float = gate(
-        10.0, "degrees", "by which most directions differ, for their axes to be doubted", "cost: a refused phone"
-    )
+    apart_deg: float = gate(10.0, "degrees", "by which directions differ if axes are doubted", "cost: a refused phone")
     better: float = gate(3.0, "times", "nearer with other axes, for these to be named", "cost: a wrong hint")
 
 
@@ -156,7 +154,7 @@ def _check_axes(
 ) -> None:
     """Refuse directions in cameras that contradict each other at the poses of the scene, turned freely or as given."""
     noise = float(np.degrees(np.median(scene.known_directions.sigma[rows])))
-    if apart <= max(GATES.apart_deg, 3.0 * noise):
+    if apart <= max(GATES.apart_deg, NORMAL.far * noise):
         return
     angles = {}
     for words, axes in _OTHER_AXES.items():

@@ -25,7 +25,7 @@ from groma.adjustment.survey.given import Survey
 from groma.adjustment.survey.names import nearest
 from groma.adjustment.terms.objects import GROUPS
 from groma.errors import InputError
-from groma.gates import gate
+from groma.gates import NORMAL, gate
 from groma.geometry import quaternion
 from groma.geometry.algebra import unit
 from groma.io.survey import DirectionsFile, DistancesFile, PlanesFile, PosesFile
@@ -51,9 +51,6 @@ class ObjectGates:
 
     parallel_deg: float = gate(
         10.0, "degrees", "from parallel, from which two lines have a shortest distance and no width", "cost: a meaning"
-    )
-    apart: float = gate(
-        5.0, "sigma", "that two skew lines must be apart, for their distance to have a side", "convention: five sigma"
     )
 
 
@@ -168,7 +165,7 @@ def distance_table(scene: Scene, given: DistancesFile, stated: float | None, not
             words = f"{given.first[row]} and {given.second[row]} are {apart:.0f} degrees from parallel"
             if Kind.PLANE in (ends[0], ends[2]):
                 raise InputError(f"{given.source}: {words}: they meet, so they have no distance. Measure from a mark.")
-            if given.distance[row] < GATES.apart * sigma[row]:
+            if given.distance[row] < NORMAL.sure * sigma[row]:
                 raise InputError(
                     f"{given.source}: {words} and as good as meet: {given.distance[row]:.3g} with a standard deviation "
                     f"of {sigma[row]:.3g} does not say on which side. Drop that line."

@@ -12,6 +12,7 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.adjustment.survey.level import GATES
 from groma.errors import InputError
+from groma.gates import NORMAL
 from groma.geometry import quaternion
 from groma.scene import Scene
 
@@ -45,7 +46,7 @@ def check_orientations(scene: Scene, rotation: FloatArray | None) -> None:
     given = quaternion.conjugate(table.cam_from_world[:, :4])
     apart = _apart(given, own, rotation)
     noise = np.degrees(np.sqrt(np.median(np.einsum("nii->ni", table.covariance)[:, 3:])))
-    if apart <= max(GATES.apart_deg, 3.0 * noise):
+    if apart <= max(GATES.apart_deg, NORMAL.far * noise):
         return
     back, wxyz = quaternion.conjugate(given), given[:, [1, 2, 3, 0]]
     others = {

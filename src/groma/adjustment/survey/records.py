@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import scipy  # its parts are imported when something of them is first used
 
-from groma.gates import gate
+from groma.gates import NORMAL, gate
 
 #: The median of the size of a standard normal number (derived from its distribution).
 _MEDIAN = 0.6745
@@ -23,18 +23,10 @@ _MEDIAN = 0.6745
 class ReliabilityGates:
     """The test for gross errors."""
 
-    level: float = gate(1e-3, "probability", "of calling a good measurement wrong", "convention: Baarda")
     power: float = gate(0.8, "probability", "of finding an error of the size told", "convention: Baarda")
-    false_alarm: float = gate(
-        0.01, "probability", "of taking anything out where nothing is wrong", "convention: one in a hundred"
-    )
-    few: int = gate(
-        5, "coordinates", "of a kind, from which on their scatter tells its noise", "cost: whether a kind is doubted"
-    )
+    few: int = gate(5, "coordinates", "of a kind, whose scatter tells its noise", "cost: whether a kind is doubted")
     checked: float = gate(0.01, "share", "below which nothing checks a measurement", "convention: of geodesy")
-    at_once: float = gate(
-        0.5, "share", "of the largest normalised residual of a kind, for what is rejected with it", "cost: rounds"
-    )
+    at_once: float = gate(0.5, "share", "of the largest residual, for what is rejected with it", "cost: rounds")
     max_rounds: int = gate(10, "rounds", "of rejecting and accepting again", "cost: most need two")
 
 
@@ -109,7 +101,7 @@ class Reliability:
     #: Sums of redundancy numbers by kind.
     redundancy: dict[str, float] = field(default_factory=dict)
     #: Level and power of the test, and the limit of normalised residuals.
-    level: float = GATES.level
+    level: float = NORMAL.gross
     power: float = GATES.power
 
     @property
@@ -141,7 +133,7 @@ class Reliability:
 def rejection_limit(measurements: Sequence[Measurement]) -> float:
     """Return the normalised residual that any of ``count`` good measurements exceeds with a small probability."""
     tests = sum(one.normalized is not None for one in measurements)
-    return float(-scipy.special.ndtri(GATES.false_alarm / (2.0 * max(tests, 1))))
+    return float(-scipy.special.ndtri(NORMAL.false_alarm / (2.0 * max(tests, 1))))
 
 
 def gross_errors(measurements: Sequence[Measurement]) -> dict[tuple[str, int], float]:
@@ -162,6 +154,6 @@ def gross_errors(measurements: Sequence[Measurement]) -> dict[tuple[str, int], f
     return found
 
 
-def noncentrality(level: float = GATES.level, power: float = GATES.power) -> float:
+def noncentrality(level: float = NORMAL.gross, power: float = GATES.power) -> float:
     """Return by how many standard deviations a mean must be off for a two-sided test to find it with a power."""
     return float(scipy.special.ndtri(power) - scipy.special.ndtri(level / 2.0))

@@ -53,6 +53,7 @@ from groma.adjustment.terms.objects import name_of, rows_by_kind
 from groma.errors import ProblemError
 from groma.factors.contract import Factor
 from groma.factors.losses import Trivial
+from groma.gates import NORMAL
 from groma.problem.gauge import world_motions
 from groma.problem.problem import Problem
 from groma.problem.residuals import jacobians_of
@@ -79,7 +80,7 @@ _UNCHECKED = 1e-6
 
 
 def reliability(
-    scene: Scene, problem: Problem | None = None, level: float = GATES.level, power: float = GATES.power
+    scene: Scene, problem: Problem | None = None, level: float = NORMAL.gross, power: float = GATES.power
 ) -> Reliability | None:
     """Compute the reliability of each external measurement: redundancy number, test and smallest detectable error.
 

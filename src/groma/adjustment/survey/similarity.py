@@ -19,7 +19,7 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray
 from groma.errors import InputError
 from groma.evaluation.alignment import align_points
-from groma.gates import chi_square_gate, gate
+from groma.gates import NORMAL, chi_square_gate, gate
 from groma.geometry import quaternion, so3
 from groma.geometry.algebra import unit
 from groma.scene import Scene, Similarity
@@ -29,15 +29,9 @@ from groma.scene import Scene, Similarity
 class SimilarityGates:
     """How a similarity to measurements is found."""
 
-    draws: int = gate(
-        500, "triples", "of correspondences tried", "derived from 1e-7 without a good one at 70 % inliers"
-    )
-    outlier: float = gate(1e-3, "probability", "of a correspondence that noise puts outside", "convention: Baarda")
+    draws: int = gate(500, "triples", "of correspondences tried", "derived from 1e-7 without a good one, 70 % inliers")
     mirrored: float = gate(
         3.0, "times", "the scatter falls if the axes are mirrored: they are left-handed", "chosen on random point sets"
-    )
-    line: float = gate(
-        3.0, "sigma", "by which points leave a line at least, or the turn about it is open", "convention: three sigma"
     )
 
 
@@ -104,7 +98,7 @@ def _fitted(source: FloatArray, target: FloatArray) -> RobustSimilarity:
         least = float(np.median(np.sum((y - best.points(x)) ** 2, axis=1)))
     inliers = np.ones(len(x), bool)
     scatter = _small_sample(len(x)) * np.sqrt(least / chi_square_gate(0.5, 3))
-    limit = chi_square_gate(GATES.outlier, 3)
+    limit = chi_square_gate(NORMAL.gross, 3)
     for _ in range(20):
         squares = np.sum((y - best.points(x)) ** 2, axis=1)
         floor = (1e-12 * np.abs(y).max()) ** 2
@@ -123,7 +117,7 @@ def _fitted(source: FloatArray, target: FloatArray) -> RobustSimilarity:
         target.mean(0) + best.translation - best.scale * best.rotation @ source.mean(0),
     )
     spread = np.linalg.svd(y[inliers] - y[inliers].mean(0), compute_uv=False) / np.sqrt(max(inliers.sum(), 1))
-    on_line = bool(spread[1] <= max(GATES.line * scatter, 1e-9 * spread[0]))
+    on_line = bool(spread[1] <= max(NORMAL.far * scatter, 1e-9 * spread[0]))
     return RobustSimilarity(whole, y - best.points(x), inliers, float(scatter), on_line)
 
 

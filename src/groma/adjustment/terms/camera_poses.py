@@ -39,9 +39,7 @@ from groma.scene import Scene
 class HeldScaleGates:
     """When the scale is held, and how firmly."""
 
-    max_shrinkage: float = gate(
-        0.001, "1", "by which relations may shrink a scene", "convention: a millimetre of a metre"
-    )
+    max_shrinkage: float = gate(0.001, "1", "by which relations may shrink a scene", "convention: a millimetre a metre")
 
 
 #: The defaults.

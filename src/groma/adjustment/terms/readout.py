@@ -40,9 +40,7 @@ MOTIONS = "motions"
 class ReadoutGates:
     """Which row counts."""
 
-    near: float = gate(
-        4.0, "sigma", "from the observed place within which the predicted row counts", "convention: four sigma"
-    )
+    near: float = gate(4.0, "sigma", "from the observed place, where a predicted row counts", "convention: four sigma")
     iterations: int = gate(3, "times", "that a row is predicted", "cost: each is ten times nearer than the last")
 
 

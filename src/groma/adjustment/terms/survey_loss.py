@@ -4,25 +4,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from groma._typing import FloatArray
 from groma.factors.losses import Huber
-from groma.gates import chi_square_gate, gate
-
-
-@dataclass(frozen=True)
-class SurveyGates:
-    """Which measurements count as good as they are stated to be."""
-
-    doubted: float = gate(
-        1e-3, "probability", "of a measurement without an error whose influence is limited", "convention: Baarda"
-    )
-
-
-GATES = SurveyGates()
+from groma.gates import NORMAL, chi_square_gate
 
 
 def survey_loss(coordinates: int) -> Huber:
@@ -31,7 +18,7 @@ def survey_loss(coordinates: int) -> Huber:
     Least squares up to where one in a thousand ends, linear beyond: good measurements count in full, and a wrong one
     pulls no more than a bad one. It is convex, so that a standard deviation stated too small costs weight, not the map.
     """
-    return Huber(math.sqrt(chi_square_gate(GATES.doubted, coordinates)))
+    return Huber(math.sqrt(chi_square_gate(NORMAL.gross, coordinates)))
 
 
 def root_information(covariance: FloatArray) -> FloatArray:

@@ -45,16 +45,10 @@ class MotionGates:
     longest: float = gate(10.0, "1", "norm of a step, else the refinement is given up", "cost: it has gone astray")
     converged: float = gate(1e-3, "1", "gain of chi square that ends it", "derived from the variance of a chi square")
     damped: float = gate(10.0, "times", "less damping after a step that helped, more after another", "cost: steps")
-    odds: float = gate(
-        9.2, "1", "least gain over another motion", "derived from odds of 100 to 1: twice their logarithm"
-    )
-    elsewhere: float = gate(
-        0.2, "1", "median shift of the places by another motion, of their extent", "cost: of refining"
-    )
+    odds: float = gate(9.2, "1", "least gain over another motion", "derived from 2 log of odds of 100 to 1")
+    elsewhere: float = gate(0.2, "1", "median shift of places by another motion, of their extent", "cost: of refining")
     apart: float = gate(100.0, "1", "squared distance of different motions, in sigma", "convention: ten sigma")
-    feigned: float = gate(
-        0.5, "share", "of information that noise may feign", "derived from 1 where there is nothing else"
-    )
+    feigned: float = gate(0.5, "share", "of information that noise may feign", "derived from 1 where nothing else is")
     draws: int = gate(24, "draws", "of noise that is added once more", "cost: linear in it")
 
 

@@ -75,18 +75,22 @@ class FactorCheck:
 
 
 # --------------------------------------------------------------------------------------------------------- Evaluation
-def _residuals(factor: Factor, ambients: tuple[FloatArray, ...], begin: int = 0, end: int | None = None) -> FloatArray:
+def residuals_of(
+    factor: Factor, ambients: tuple[FloatArray, ...], begin: int = 0, end: int | None = None
+) -> FloatArray:
+    """Return the residuals (N, m) of a range of factors."""
     end = len(factor) if end is None else end
     out = np.full((end - begin, factor.residual_size), np.nan)
     factor.residuals(factor.prepare(ambients), begin, end, out)
     return out
 
 
-def _block_sizes(example: Example) -> list[int]:
+def block_sizes_of(example: Example) -> list[int]:
+    """Return the columns of each block of a record."""
     return [example.variables[ref.group][0].factor_columns for _, ref in example.factor.references()]
 
 
-def _linearize(
+def linearized(
     factor: Factor, ambients: tuple[FloatArray, ...], sizes: list[int], begin: int = 0, end: int | None = None
 ) -> tuple[FloatArray, int]:
     """Return records with all blocks side by side, and the number of degenerate factors."""
@@ -97,7 +101,8 @@ def _linearize(
     return record, degenerate
 
 
-def _ambients(example: Example) -> tuple[FloatArray, ...]:
+def ambients_of(example: Example) -> tuple[FloatArray, ...]:
+    """Return the coordinates that each slot of the factor refers to."""
     groups = {
         name: np.ascontiguousarray(manifold.ambient(state)) for name, (manifold, state) in example.variables.items()
     }
@@ -112,28 +117,28 @@ def _charts_to_try(manifold: Manifold, state: FloatArray) -> Iterator[tuple[Mani
             yield chart, chart.from_ambient(ambient)
 
 
-def compare_jacobians(example: Example, tolerance: float = TOLERANCE, step: float = STEP) -> tuple[BlockCheck, ...]:
+def compare_jacobians(example: Example, tolerance: float = TOLERANCE) -> tuple[BlockCheck, ...]:
     """Compare every Jacobian block of an example with differences, in every chart of its kind."""
-    factor, sizes = example.factor, _block_sizes(example)
+    factor, sizes = example.factor, block_sizes_of(example)
     starts = np.cumsum([0, *sizes])
     checks = []
     for b, (slot, ref) in enumerate(factor.references()):
         for chart, state in _charts_to_try(*example.variables[ref.group]):
-            ambients = list(_ambients(example))
+            ambients = list(ambients_of(example))
 
             def moved(k: int, h: float, b=b, chart=chart, state=state, ambients=ambients) -> FloatArray:
                 delta = np.zeros((len(state), chart.dof))
                 delta[:, k] = h
                 ambients[b] = np.ascontiguousarray(chart.ambient(chart.retract(state, delta)))
-                return _residuals(factor, tuple(ambients))
+                return residuals_of(factor, tuple(ambients))
 
             numeric = np.empty((len(factor), factor.residual_size, chart.dof))
             for k in range(chart.dof):
-                near = moved(k, step) - moved(k, -step)
-                far = moved(k, 2 * step) - moved(k, -2 * step)
-                numeric[:, :, k] = (8 * near - far) / (12 * step)
+                near = moved(k, STEP) - moved(k, -STEP)
+                far = moved(k, 2 * STEP) - moved(k, -2 * STEP)
+                numeric[:, :, k] = (8 * near - far) / (12 * STEP)
             ambients[b] = np.ascontiguousarray(chart.ambient(state))
-            record, degenerate = _linearize(factor, tuple(ambients), sizes)
+            record, degenerate = linearized(factor, tuple(ambients), sizes)
             if degenerate:
                 raise ProblemError(
                     f"{degenerate} of the {len(factor)} factors in the example of {type(factor).__name__} are "
@@ -169,29 +174,29 @@ def _require(condition: bool, name: str, message: str) -> None:
 
 def _check_ranges(name: str, example: Example) -> None:
     """Part of the factors, none of them, another order, and columns that are not wanted."""
-    factor, sizes, ambients = example.factor, _block_sizes(example), _ambients(example)
+    factor, sizes, ambients = example.factor, block_sizes_of(example), ambients_of(example)
     count = len(factor)
-    record, _ = _linearize(factor, ambients, sizes)
+    record, _ = linearized(factor, ambients, sizes)
     _require(bool(np.isfinite(record).all()), name, "linearize() left a NaN or wrote less than its columns.")
-    residual = _residuals(factor, ambients)
+    residual = residuals_of(factor, ambients)
     _require(
         np.allclose(residual, record[:, :, -1], rtol=1e-12, atol=1e-12),
         name,
         f"residuals() and the last column of linearize() differ:\n{residual}\n{record[:, :, -1]}",
     )
     begin, end = count // 3, count - 1
-    same = np.array_equal(_linearize(factor, ambients, sizes, begin, end)[0], record[begin:end])
+    same = np.array_equal(linearized(factor, ambients, sizes, begin, end)[0], record[begin:end])
     _require(same, name, f"linearize({begin}, {end}) differs from those rows of linearize(0, {count}).")
-    same = np.array_equal(_residuals(factor, ambients, begin, end), residual[begin:end])
+    same = np.array_equal(residuals_of(factor, ambients, begin, end), residual[begin:end])
     _require(same, name, f"residuals({begin}, {end}) differs from those rows of residuals(0, {count}).")
-    empty, degenerate = _linearize(factor, ambients, sizes, 1, 1)
+    empty, degenerate = linearized(factor, ambients, sizes, 1, 1)
     _require(len(empty) == 0 and degenerate == 0, name, "an empty range counts degenerate factors.")
     order = np.arange(count)[::-1]
-    same = np.array_equal(_linearize(factor.take(order), ambients, sizes)[0], record[order])
+    same = np.array_equal(linearized(factor.take(order), ambients, sizes)[0], record[order])
     _require(same, name, "take() in reverse order does not give the records in reverse order.")
     nothing = factor.take(np.zeros(0, np.int64))
     _require(len(nothing) == 0, name, "take() of no factor is not empty.")
-    _require(len(_linearize(nothing, ambients, sizes)[0]) == 0, name, "no factors give records.")
+    _require(len(linearized(nothing, ambients, sizes)[0]) == 0, name, "no factors give records.")
     starts = np.cumsum([0, *sizes])
     for unwanted in range(len(sizes)):
         columns = tuple(-1 if b == unwanted else int(starts[b]) for b in range(len(sizes)))
@@ -207,18 +212,18 @@ def _check_world(name: str, example: Example, rng: np.random.Generator) -> None:
     factor = example.factor
     if factor.invariance is not None:
         slots = [slot for slot, _ in factor.references()]
-        ambients = _ambients(example)
-        check_invariance(name, factor.invariance, slots, ambients, lambda moved: _residuals(factor, moved), rng)
+        ambients = ambients_of(example)
+        check_invariance(name, factor.invariance, slots, ambients, lambda moved: residuals_of(factor, moved), rng)
 
 
 def _check_degenerate(name: str, example: Example) -> None:
     """Variables that are no object at all (all zeros) must give zeros, never NaN."""
-    factor, sizes = example.factor, _block_sizes(example)
+    factor, sizes = example.factor, block_sizes_of(example)
     for b, (slot, _) in enumerate(factor.references()):
-        ambients = list(_ambients(example))
+        ambients = list(ambients_of(example))
         ambients[b] = np.zeros_like(ambients[b])
-        record, degenerate = _linearize(factor, tuple(ambients), sizes)
-        residual = _residuals(factor, tuple(ambients))
+        record, degenerate = linearized(factor, tuple(ambients), sizes)
+        residual = residuals_of(factor, tuple(ambients))
         finite = bool(np.isfinite(record).all() and np.isfinite(residual).all())
         _require(finite, name, f"NaN or infinity where slot {slot.name!r} is zero.")
         zero = ~record.any(axis=(1, 2))

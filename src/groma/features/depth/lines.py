@@ -18,7 +18,6 @@ distances on either side, each side is fitted on its own, and :math:`\rho_1, \rh
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,35 +27,20 @@ from groma._typing import BoolArray, FloatArray
 from groma.errors import InputError, ShapeError
 from groma.features.depth.line_fit import CREASE, LEFT, NONE, RIGHT, SURFACE, fit_all
 from groma.features.depth.noise import DepthNoise, as_depth, as_pinhole
-from groma.gates import gate
+from groma.gates import KINECT, NORMAL, chi_square_gate, gate
 
 
 @dataclass(frozen=True)
 class DepthLineGates:
     """Where depth is sampled beside a segment, and what the samples must agree on."""
 
-    near: float = gate(
-        1.5, "px", "depth is sampled from this distance on", "chosen on Kinect images: edges are smeared"
-    )
+    near: float = gate(1.5, "px", "depth is sampled from this distance on", "chosen on Kinect images: smeared edges")
     far: float = gate(6.5, "px", "and up to this distance", "chosen on Kinect images")
     min_share: float = gate(0.35, "share", "share of the samples of a side on its fit", "chosen on Kinect images")
-    max_relative_sigma: float = gate(
-        0.05, "share", "noise of the depth at an end, of the depth", "chosen on Kinect images"
-    )
-    inlier: float = gate(3.0, "sigma", "samples within are on the fit", "derived from normal noise: 1 in 370")
+    max_relative_sigma: float = gate(0.05, "share", "noise at an end, of its depth", KINECT)
     shares: tuple[float, ...] = gate(
-        (0.04, 0.015, 0.006, 0.0),
-        "share",
-        "added to it from round to round, of the inverse depth",
-        "chosen on Kinect images",
+        (0.04, 0.015, 0.006, 0.0), "share", "added to the noise round by round, of the inverse depth", KINECT
     )
-    agree: float = gate(
-        -2.0 * math.log(1e-3),
-        "sigma squared",
-        "two sides agree in a line",
-        "derived from chi-square, 2 numbers: 1 in 1000",
-    )
-    agree_slope: float = gate(9.0, "sigma squared", "they agree in the slope", "derived from normal noise: 1 in 370")
     agree_share: float = gate(0.006, "share", "on top of noise, of the inverse depth", "chosen on Kinect images")
     slope_share: float = gate(0.0015, "share / px", "the same for the slope", "chosen on Kinect images")
     min_length: float = gate(4.0, "px", "shorter segments have no line", "derived from two samples a half")
@@ -150,8 +134,8 @@ def fit_depth_lines(
     inverse_depth, covariance = np.empty((count, 2)), np.empty((count, 2, 2))
     support, share = np.empty(count, np.int8), np.empty(count)
     own = (
-        (gates.near, gates.far), gates.min_share, gates.min_length, gates.inlier, float(gates.min_inliers),
-        (gates.agree, gates.agree_slope, gates.agree_share, gates.slope_share),
+        (gates.near, gates.far), gates.min_share, gates.min_length, NORMAL.far, float(gates.min_inliers),
+        (chi_square_gate(NORMAL.gross, 2), NORMAL.far**2, gates.agree_share, gates.slope_share),
     )  # fmt: skip
     fit_all(
         segments, image, noise.numbers, noise.correlation, own, np.array(gates.shares), inverse_depth, covariance,

@@ -30,6 +30,7 @@ from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
 from groma.features.depth.noise import DepthNoise, as_depth, as_pinhole
 from groma.features.depth.regions import MAX_REGIONS, REGIONS, assign, block_sums, grow, join
+from groma.gates import NORMAL
 from groma.geometry.charts.plane_normal_offset import NormalOffsetPlane
 
 
@@ -141,12 +142,12 @@ def find_depth_planes(
     cos_floor = math.cos(math.radians(options.angle_deg))
     limits = (float(options.gate), float(options.bend), cos_floor)
     found = grow(
-        sums, counts, numbers, limits, (float(REGIONS.min_count), REGIONS.flat, REGIONS.turn), min_blocks, block_labels,
-        regions, region_counts,
+        sums, counts, numbers, limits, (float(REGIONS.min_count), REGIONS.flat, NORMAL.far**2), min_blocks,
+        block_labels, regions, region_counts,
     )  # fmt: skip
     target = np.zeros(found, np.int64)
-    join(regions, region_counts, found, numbers, limits, (REGIONS.looser, REGIONS.turn), target)
-    return _refined(image, camera, noise, options, REGIONS.inlier, block_labels, regions, region_counts, target)
+    join(regions, region_counts, found, numbers, limits, (REGIONS.looser, NORMAL.far**2), target)
+    return _refined(image, camera, noise, options, NORMAL.far, block_labels, regions, region_counts, target)
 
 
 def _for_density(options: PlaneSearchOptions, image: npt.NDArray[np.float32], min_count: int) -> PlaneSearchOptions:

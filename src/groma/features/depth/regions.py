@@ -28,10 +28,6 @@ class RegionGates:
 
     min_count: int = gate(6, "samples", "samples that a block needs", "derived from 3 unknowns")
     flat: float = gate(0.12, "cosine", "planes seen at a flatter angle are not used", "chosen on Kinect images")
-    inlier: float = gate(3.0, "sigma", "a pixel within belongs to a plane", "derived from normal noise: 1 in 370")
-    turn: float = gate(
-        9.0, "sigma squared", "normals that differ by less may be joined", "derived from normal noise: 1 in 370"
-    )
     looser: float = gate(1.3, "ratio", "joined regions fit worse by at most this factor", "chosen on Kinect images")
 
 

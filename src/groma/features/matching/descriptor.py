@@ -31,7 +31,7 @@ from groma._numba import kernel, loop
 from groma.errors import InputError
 from groma.features.images import to_gray
 from groma.features.segments import Segments
-from groma.gates import gate
+from groma.gates import STRECHA, gate
 
 Descriptors = npt.NDArray[np.float32]
 #: Bands beside a segment: with it the size of a descriptor.
@@ -45,9 +45,7 @@ class DescriptorGates:
 
     max_entry: float = gate(0.4, "1", "entries of the unit vector are cut here", "convention: LBD, Zhang and Koch 2013")
     max_samples: int = gate(48, "samples", "samples along a segment", "cost: time per segment")
-    fade: float = gate(
-        0.6, "share", "standard deviation of the weight of rows, of the half width", "chosen on Strecha's scenes"
-    )
+    fade: float = gate(0.6, "share", "deviation of the weight of rows, of the half width", STRECHA)
     overlap: float = gate(1.25, "bands", "half width of the weight of rows in a band", "chosen on Strecha's scenes")
     min_blur: float = gate(0.7, "px", "least standard deviation of the blur", "derived from sampling by pixels")
 

@@ -82,12 +82,8 @@ class EvidenceGates:
     points_missing: float = gate(0.3, "log odds", "for that of the points near one of them only", _SURVEYED)
     overlap: float = gate(2.4, "log odds", "for the whole epipolar overlap", _SURVEYED)
     unknown_overlap: float = gate(-0.25, "share", "stands for an overlap that is not known", _SURVEYED)
-    on_line: float = gate(
-        2.0, "px", "points so near to a line are on no side of it", "derived from edges one pixel wide"
-    )
-    min_extent: float = gate(
-        4.0, "beam tolerances", "extents across the epipolar lines that give an overlap", _SURVEYED
-    )
+    on_line: float = gate(2.0, "px", "nearer points are on no side of a line", "derived from edges one pixel wide")
+    min_extent: float = gate(4.0, "beam tolerances", "extents across epipolar lines that give an overlap", _SURVEYED)
 
 
 #: The weights in use.

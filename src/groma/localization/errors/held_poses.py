@@ -44,10 +44,9 @@ from groma.adjustment.assemble import assemble, disassemble
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.fit import noise_of
 from groma.adjustment.stages import with_loss
-from groma.factors.losses import GemanMcClure
 from groma.geometry import se3
-from groma.localization.errors.views import GATES, Views, views_of
-from groma.localization.pose.records import residual_squares
+from groma.localization.errors.views import Views, views_of
+from groma.localization.pose.records import LANDMARK_LOSS, residual_squares
 from groma.scene import PosePriors, Scene
 from groma.solver.linear.blas import one_blas_thread
 from groma.solver.options import SolverOptions
@@ -88,7 +87,7 @@ def held_poses(scene: Scene) -> HeldPoses:
     for _ in range(_ADJUSTED):
         sigma = np.tile(np.repeat(np.sqrt(np.maximum(variance, _LEAST * first)), 3), (frames, 1))
         priors = PosePriors(np.arange(frames), held, sigma)
-        problem = with_loss(assemble(scene.replace(pose_priors=priors), _FREE).problem, GemanMcClure(GATES.loss))
+        problem = with_loss(assemble(scene.replace(pose_priors=priors), _FREE).problem, LANDMARK_LOSS)
         problem = solve(problem, _SOLVER).problem
         noise = noise_of(residual_squares(problem, "points", len(seen)))
         moved = disassemble(scene, problem).replace(point_observations=seen.replace(sigma=seen.sigma * noise))

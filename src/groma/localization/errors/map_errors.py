@@ -23,7 +23,7 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.execution import map_work
-from groma.gates import gate
+from groma.gates import chi_square_gate, gate
 from groma.geometry import se3
 from groma.localization.errors.left_out import without_image
 from groma.localization.pose.camera import QueryCamera
@@ -41,7 +41,6 @@ class MapErrorGates:
     )
     least: int = gate(3, "images", "that say something about the map", "derived from the median: it stands one wrong")
     matches: int = gate(10, "matches", "that such a pose is estimated from at least", "derived from 6 unknowns")
-    median: float = gate(5.348, "1", "of the squared difference", "derived from chi-square of six degrees")
 
 
 GATES = MapErrorGates()
@@ -106,17 +105,19 @@ def _shared_error(cases: Sequence[_Case | None], gates: MapErrorGates) -> float:
         return 0.0
     d, noise, shared = (np.stack(parts) for parts in zip(*known, strict=True))
 
+    usual = chi_square_gate(0.5, 6)
+
     def median(square: float) -> float:
         return float(
             np.median(np.einsum("ni,ni->n", d, np.linalg.solve(noise + square * shared, d[..., None])[..., 0]))
         )
 
-    if median(0.0) <= gates.median:
+    if median(0.0) <= usual:
         return 0.0
     low, high = 0.0, 1e-12
-    while median(high) > gates.median:
+    while median(high) > usual:
         low, high = high, 4.0 * high
     for _ in range(30):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if median(middle) > gates.median else (low, middle)
+        low, high = (middle, high) if median(middle) > usual else (low, middle)
     return float(np.sqrt(0.5 * (low + high)))

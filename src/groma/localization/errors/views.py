@@ -10,19 +10,8 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
-from groma.gates import gate
-from groma.localization.pose.records import landmark_rows, motions_of_lines, records, times
+from groma.localization.pose.records import LANDMARK_LOSS, landmark_rows, motions_of_lines, records, times
 from groma.scene import Scene
-
-
-@dataclass(frozen=True)
-class ViewGates:
-    """Which observations of a map tell about it."""
-
-    loss: float = gate(3.0, "sigma", "scale of the Geman-McClure loss of its landmarks", "convention: three sigma")
-
-
-GATES = ViewGates()
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +57,7 @@ def views_of(scene: Scene, kind: str, parameters: int) -> Views:
         count = 0 if lens is None else problem.variables[lens.group].state.shape[1]
         wanted = {"pose": 6, **({"intrinsics": count} if count else {}), kind[:-1]: size}
         white = times(factor.sqrt_information, records(problem, factor, wanted))
-        white /= 1.0 + (white[..., -1:] ** 2).sum(axis=1, keepdims=True) / GATES.loss**2  # the root of its weight
+        white /= 1.0 + (white[..., -1:] ** 2).sum(axis=1, keepdims=True) / LANDMARK_LOSS.scale**2  # root of its weight
         by_camera = np.zeros((len(factor), 2, parameters))
         by_camera[..., :count] = white[..., 6 : 6 + count]
         camera = np.zeros(len(factor), np.int64) if lens is None else cameras[lens.group][lens.index]

@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 
 from groma._counted import counted
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.gates import gate
+from groma.gates import NORMAL, gate
 from groma.scene import ControlPoints, PointDepths, PrincipalPointPriors, Scene, Similarity
 from groma.scene.survey import CHECK, CONTROL, UNKNOWN
 from groma.scene.table import Table, joined, moved_table, new_index_of
@@ -31,9 +31,6 @@ class CarriedGates:
     """Which measurements of one map hold in another."""
 
     same_place: float = gate(1.0, "px", "distance of an observation of the same feature", "convention: one pixel")
-    same_world: float = gate(
-        3.0, "sigma", "of measured places: worlds in which cameras are as near are one", "derived from normal noise"
-    )
 
 
 GATES = CarriedGates()
@@ -99,7 +96,7 @@ def _is_same_world(first: Scene, second: Scene, motion: Similarity) -> bool:
     centers = second.cam_centers_in_world
     variances = [_variance(first), _variance(second)]
     away = np.linalg.norm(motion.points(centers) - centers, axis=1)
-    return bool(np.median(away) <= GATES.same_world * np.sqrt(sum(variances)))
+    return bool(np.median(away) <= NORMAL.far * np.sqrt(sum(variances)))
 
 
 def _variance(scene: Scene) -> float:

@@ -32,6 +32,7 @@ from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.verdict import moved as way_between
 from groma.localization.posed_model import gather_photographs, with_photographs
 from groma.mapping.carried.kept_lines import with_lines_of
+from groma.mapping.carried.measured import GATES as CARRIED
 from groma.mapping.noise.landmarks import project_points
 from groma.scene import Scene, Similarity
 
@@ -42,7 +43,6 @@ class MergeGates:
 
     photographs: int = gate(24, "images", "of the second map that are looked for in the first", "cost: linear in it")
     same_place: float = gate(0.5, "px", "distance of the same feature, found twice", "convention: half a pixel")
-    same_line: float = gate(2.0, "px", "distance of the same segment, found twice", "convention: two pixels")
     growth: float = gate(2.0, "1", "of the noise, until half of the matches agree", "convention: doubling")
     doublings: int = gate(
         6, "steps", "of the noise: that of landmarks is without errors of poses", "cost: of estimates"
@@ -81,7 +81,7 @@ class MergedModel:
 
     def with_lines(self, scene: Scene) -> Scene:
         """Return what was mapped of the model, with lines of both maps that were not found anew."""
-        return with_lines_of(scene, self.maps, self.names, self.same_lines, GATES.same_line)
+        return with_lines_of(scene, self.maps, self.names, self.same_lines, CARRIED.same_segment)
 
     def sentence(self) -> str:
         """Say how the maps were joined."""
@@ -231,7 +231,7 @@ def _same_lines(second: Localizer, image: int, found: LocalizedImage) -> IntArra
         return np.zeros((0, 2), np.int64)
     off = segments_apart(query.reshape(-1, 4), seen.segment[rows])
     nearest = off.argmin(axis=1)
-    hit = np.flatnonzero(off[np.arange(len(query)), nearest] < GATES.same_line)
+    hit = np.flatnonzero(off[np.arange(len(query)), nearest] < CARRIED.same_segment)
     return np.column_stack([seen.line_idx[rows[nearest[hit]]], found.line[inliers[hit]]])
 
 

@@ -12,10 +12,7 @@ from groma.gates import gate
 class HypothesisGates:
     """Which poses are proposed from few matches."""
 
-    outlier: float = gate(3e-3, "probability", "of a residual that noise exceeds", "convention: three sigma")
-    slack: float = gate(
-        2.0, "1", "of that residual for poses from few matches", "derived from noise: such poses are noisier themselves"
-    )
+    slack: float = gate(2.0, "1", "of the limit, for poses from few matches", "derived from noise: they are noisier")
     confidence: float = gate(0.9999, "probability", "that one sample held no outlier", "convention: PoseLib's default")
     min_trials: int = gate(
         100, "samples", "drawn at least", "chosen on castle, fountain, kitchen: as many agree as with 1,000"
@@ -28,7 +25,6 @@ class HypothesisGates:
 class RefinementGates:
     """How a pose is fitted to what agrees with it."""
 
-    outlier: float = gate(3e-3, "probability", "of a residual that noise exceeds", "convention: three sigma")
     rounds: int = gate(5, "rounds", "of collecting what is near the pose, at most", "cost: of a fit each")
     wide_loss: float = gate(1.5, "sigma", "scale of the Cauchy loss of these", "chosen on tracked sequences")
     last_loss: float = gate(

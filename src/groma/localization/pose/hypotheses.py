@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray
-from groma.gates import chi_square_gate
+from groma.gates import NORMAL, chi_square_gate
 from groma.geometry import quaternion
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.gates import HYPOTHESES
@@ -53,7 +53,7 @@ def straightened(camera: QueryCamera, matches: Matches) -> Straight:
 
 def max_errors(matches: Matches) -> tuple[float, float]:
     """Return how far points, and ends of segments from their lines, may lie from where a proposed pose puts them."""
-    factor = HYPOTHESES.slack * float(np.sqrt(chi_square_gate(HYPOTHESES.outlier, 2)))
+    factor = HYPOTHESES.slack * float(np.sqrt(chi_square_gate(NORMAL.outlier, 2)))
     sigmas = (matches.point_sigma, matches.segment_sigma)
     points, lines = (factor * float(np.median(sigma)) if len(sigma) else factor for sigma in sigmas)
     return points, lines

@@ -10,10 +10,11 @@ import numpy as np
 from groma._typing import FloatArray, IntArray
 from groma.factors.contract import Factor
 from groma.factors.losses import GemanMcClure
+from groma.gates import NORMAL
 from groma.problem.problem import Problem
 
 #: Loss that landmarks of a map are estimated with in the end (convention: three standard deviations).
-LANDMARK_LOSS = GemanMcClure(3.0)
+LANDMARK_LOSS = GemanMcClure(NORMAL.far)
 
 
 def landmark_rows(factor: Factor, group: str) -> IntArray | None:

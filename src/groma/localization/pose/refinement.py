@@ -36,7 +36,7 @@ import numpy as np
 from groma._numba import loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.factors.losses import Cauchy, GemanMcClure
-from groma.gates import chi_square_gate
+from groma.gates import NORMAL, chi_square_gate
 from groma.geometry import se3
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.free_lens import FreeLens
@@ -252,7 +252,7 @@ def refine(
 
 
 def _agreeing(squares: tuple[FloatArray, FloatArray]) -> int:
-    return int((np.concatenate(squares) <= chi_square_gate(REFINEMENT.outlier, 2)).sum())
+    return int((np.concatenate(squares) <= chi_square_gate(NORMAL.outlier, 2)).sum())
 
 
 def last_scale(agree: int) -> float:
@@ -287,7 +287,7 @@ def fitted_at(
     points = residuals(one, weights, "points", matches.num_points, directions)
     lines = residuals(one, weights, "lines", matches.num_lines, directions)
     sigma0 = _noise((points, lines), matches, max_error)
-    limit = chi_square_gate(REFINEMENT.outlier, 2) * sigma0**2
+    limit = chi_square_gate(NORMAL.outlier, 2) * sigma0**2
     near = (points.square <= limit, (lines.square <= limit) & _in_front(camera, matches, one.pose))
     agree = [
         nearest_claims(claim, found.square, inside)

@@ -19,7 +19,7 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.features.depth.noise import DepthNoise
-from groma.gates import gate
+from groma.gates import NORMAL, gate
 from groma.mapping.depth.unit import ROBUST
 
 
@@ -27,21 +27,12 @@ from groma.mapping.depth.unit import ROBUST
 class MapNoiseGates:
     """How the noise of depth maps is estimated."""
 
-    min_points: int = gate(
-        100, "depths", "from which noise is estimated; else that of a Kinect", "convention: a hundred"
-    )
+    min_points: int = gate(100, "depths", "that tell noise; else that of a Kinect", "convention: a hundred")
     groups: int = gate(10, "groups", "of depths, from near to far", "cost: two numbers are fitted")
-    known_share: float = gate(
-        0.5, "share", "of a group, the depths of the best known points, that tell it", "convention: a half"
-    )
+    known_share: float = gate(0.5, "share", "of a group, the best known points, that tell it", "convention: a half")
     least: float = gate(1e-4, "share", "of the depth: no depth is known better", "derived from 16-bit files")
     cells: int = gate(6, "cells", "along the width of an image, in which errors are alike", "cost: 36 in a square")
-    mistake: float = gate(
-        4.0, "sigma", "differences beyond are mistakes", "derived from normal noise: exceeded once in 16 000"
-    )
-    correlation: float = gate(
-        6.0, "samples", "neighbouring pixels that err alike count as one", "chosen on cabinet, redkitchen"
-    )
+    correlation: float = gate(6.0, "samples", "pixels that err alike count as one", "chosen on cabinet, redkitchen")
 
 
 NOISE = MapNoiseGates()
@@ -89,7 +80,7 @@ def fitted_noise(depth: FloatArray, difference: FloatArray, sigma: FloatArray) -
 
 def shared_errors(whitened: FloatArray, image_idx: IntArray, cell: IntArray) -> SharedErrors:
     """Return the correlations of whitened differences (N,), by products of all pairs in a cell, and in an image."""
-    good = np.abs(whitened) < NOISE.mistake
+    good = np.abs(whitened) < NORMAL.mistake
     values, image, cell = whitened[good], image_idx[good], cell[good]
     if len(values) < NOISE.min_points:
         return SharedErrors()

@@ -15,7 +15,7 @@ import numpy as np
 from groma._counted import counted, first_of
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
-from groma.gates import gate
+from groma.gates import NORMAL, gate
 
 #: A median absolute deviation of normal noise times this is a standard deviation (derived from the normal
 #: distribution).
@@ -29,12 +29,6 @@ class UnitGates:
     min_points: int = gate(10, "points", "with a depth, that tell a unit", "convention: ten")
     max_scatter: float = gate(
         0.25, "log", "scatter of the ratios of depths of a map whose unit is estimated", "convention: a quarter"
-    )
-    min_significance: float = gate(
-        5.0,
-        "sigma",
-        "by which depths fall where those of points grow: they are another quantity",
-        "convention: five sigma",
     )
     different: float = gate(
         0.1, "log", "scatter of the units of the maps, from which on they are no common one", "convention: a tenth"
@@ -104,7 +98,7 @@ def own_units(
         growth = _growth(np.log(depth[rows] / ratio[rows]), np.log(depth[rows]))
         if len(rows) < UNITS.min_points:
             reasons["too few points"] += 1
-        elif growth < -UNITS.min_significance:
+        elif growth < -NORMAL.sure:
             reasons["falling depths"] += 1
         elif _spread(level) > UNITS.max_scatter:
             reasons["scatter"] += 1

@@ -52,9 +52,7 @@ WEIGHTS: dict[str, float] = {
 class ConfidenceGates:
     """What a line must be within to be right."""
 
-    tolerance: float = gate(
-        0.0025, "1", "error of a right line over the usual distance", "convention: two pixels of a usual lens"
-    )
+    tolerance: float = gate(0.0025, "1", "error of a right line over the distance", "convention: two pixels")
     edge_px: float = gate(1.0, "px", "residual of a segment of a right line", "derived from the width of an edge")
 
 

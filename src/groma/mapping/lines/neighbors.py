@@ -20,7 +20,7 @@ import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_in_threads
-from groma.gates import gate
+from groma.gates import LINE_MAPS, gate
 from groma.geometry import quaternion
 from groma.scene import Scene
 
@@ -32,24 +32,11 @@ if TYPE_CHECKING:
 class NeighborGates:
     """Which images are good neighbours."""
 
-    min_angle_deg: float = gate(
-        4.0, "deg", "between rays of shared points, below which they count less", "chosen on benchmarks/lines.py"
-    )
-    max_angle_deg: float = gate(
-        25.0, "deg", "between rays of shared points, above which they count less", "chosen on benchmarks/lines.py"
-    )
-    sample: int = gate(
-        64, "points", "sampled per pair of images for the angle", "cost: the median of so many is enough"
-    )
-    max_turn_deg: float = gate(
-        60.0, "deg", "between viewing directions, where there are no points", "chosen on benchmarks/lines.py"
-    )
-    turn_scale_deg: float = gate(
-        20.0,
-        "deg",
-        "of turn that counts like the usual distance, where there are no points",
-        "chosen on benchmarks/lines.py",
-    )
+    min_angle_deg: float = gate(4.0, "deg", "between rays, below which points count less", LINE_MAPS)
+    max_angle_deg: float = gate(25.0, "deg", "between rays, above which points count less", LINE_MAPS)
+    sample: int = gate(64, "points", "per pair of images for the angle", "cost: the median of so many is enough")
+    max_turn_deg: float = gate(60.0, "deg", "between viewing directions without points", LINE_MAPS)
+    turn_scale_deg: float = gate(20.0, "deg", "of turn like the usual distance, without points", LINE_MAPS)
 
 
 GATES = NeighborGates()

@@ -19,7 +19,7 @@ from groma._trees import kd_tree, nearest
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_in_threads, map_work
 from groma.features.segments import Segments
-from groma.gates import gate
+from groma.gates import LINE_MAPS, gate
 from groma.geometry import quaternion, segment2
 from groma.mapping.groups import grouped
 from groma.scene import Scene
@@ -29,20 +29,11 @@ from groma.scene import Scene
 class ViewGates:
     """Where segments are looked for in depth."""
 
-    num_near: int = gate(
-        6, "points", "around each end and the middle of a segment that tell its depth", "chosen on benchmarks/lines.py"
-    )
-    depth_quantile: float = gate(
-        0.01,
-        "quantile",
-        "of the inverse depths in an image, at either end of its range",
-        "chosen on benchmarks/lines.py",
-    )
-    num_baselines: int = gate(
-        5, "images", "nearest cameras that tell the scale where there are no points", "chosen on benchmarks/lines.py"
-    )
+    num_near: int = gate(6, "points", "at ends and middle of a segment that tell its depth", LINE_MAPS)
+    depth_quantile: float = gate(0.01, "quantile", "of inverse depths in an image, at either end", LINE_MAPS)
+    num_baselines: int = gate(5, "images", "nearest cameras that tell the scale without points", LINE_MAPS)
     inverse_depth_range: tuple[float, float] = gate(
-        (1e-3, 2.0), "1/baseline", "inverse depths searched where there are no points", "chosen on benchmarks/lines.py"
+        (1e-3, 2.0), "1/baseline", "searched where no points are", LINE_MAPS
     )
 
 

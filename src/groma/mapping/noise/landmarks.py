@@ -18,7 +18,7 @@ import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_ranges
-from groma.gates import gate
+from groma.gates import SURVEYED, gate
 from groma.geometry import quaternion
 from groma.geometry.algebra import apply, cross, dot, norm, perpendicular, ratio, unit
 from groma.scene import Scene
@@ -29,15 +29,8 @@ from groma.scene.line_intervals import shares_on_lines
 class LandmarkNoiseGates:
     """What is believed of the noise of a landmark."""
 
-    min_sigma_px: float = gate(
-        0.02, "px", "deviation of a coordinate at least", "convention: synthetic scenes may have none"
-    )
-    max_share: float = gate(
-        3.0,
-        "1",
-        "lengths of a line from its middle, where a ray still tells where it ends",
-        "chosen on benchmarks/surveyed.py",
-    )
+    min_sigma_px: float = gate(0.02, "px", "of a coordinate at least", "convention: synthetic scenes have none")
+    max_share: float = gate(3.0, "1", "lengths from its middle where rays tell an end", SURVEYED)
 
 
 GATES = LandmarkNoiseGates()

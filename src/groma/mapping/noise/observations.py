@@ -44,9 +44,7 @@ class ObservationNoiseGates:
     """From how many residuals noise is estimated, and what is believed of it."""
 
     unknown_px: float = gate(1.0, "px", "noise where nothing tells it", "convention: a pixel")
-    max_fitted: float = gate(
-        0.8, "share", "of the residuals that landmarks take at most", "derived from five tracks of two"
-    )
+    max_fitted: float = gate(0.8, "share", "of the residuals that landmarks take", "derived from five tracks of two")
     min_views: int = gate(
         4, "observations", "of a landmark that tells its noise from chance", "derived from one degree of freedom in two"
     )

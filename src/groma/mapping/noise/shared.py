@@ -25,7 +25,7 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.execution import map_in_threads
-from groma.gates import gate
+from groma.gates import NORMAL, SURVEYED, gate
 from groma.mapping.noise.landmarks import pixels_of
 from groma.scene import Scene
 
@@ -38,15 +38,9 @@ class SharedNoiseGates:
     rings: tuple[float, ...] = gate(
         (1.0, 2.0, 4.0, 8.0, 16.0), "cells", "distances at which rings of pairs end", "convention: doubling"
     )
-    min_observations: int = gate(
-        1000, "observations", "fewer tell nothing of what they share", "chosen on benchmarks/surveyed.py"
-    )
+    min_observations: int = gate(1000, "observations", "that tell what they share", SURVEYED)
     min_share: float = gate(
         0.25, "share", "of the variance of errors that residuals have at least", "derived from points of two views"
-    )
-    min_significance: float = gate(3.0, "sigma", "of a covariance that is believed", "convention: three sigma")
-    max_residual: float = gate(
-        4.0, "sigma", "residuals beyond are mistakes", "derived from normal noise: exceeded once in 3 000"
     )
 
 
@@ -79,7 +73,7 @@ def with_shared_noise(scene: Scene, point_sigma_px: float, line_sigma_px: float)
     sigma, line_sigma = point_sigma_px * points.sigma, line_sigma_px * lines.sigma
     pixels = pixels_of(scene, points.image_idx, scene.points.xyz[points.point_idx])
     residual = (pixels - points.pixel) / sigma[:, None]
-    told = (times == 1) & (np.einsum("ni,ni->n", residual, residual) < GATES.max_residual**2)
+    told = (times == 1) & (np.einsum("ni,ni->n", residual, residual) < NORMAL.mistake**2)
     covariance = _covariance(grid, cells[told], residual[told], sigma[told])
     information = grid.sums(cells, 1.0 / sigma**2) + grid.sums(middles, 1.0 / line_sigma**2)
     around = grid.smoothed(information, covariance).reshape(-1)
@@ -159,7 +153,7 @@ def _covariance(grid: _Grid, cells: IntArray, residual: FloatArray, sigma: Float
         total = max(weights[ring].sum(), 1e-300)
         # Every pair is there twice, in two coordinates: the deviation of their mean is one over the root of the sum.
         least = min(least, 0.5 * products[ring].sum() / total)
-        if least < GATES.min_significance / np.sqrt(total):
+        if least < NORMAL.far / np.sqrt(total):
             break
         covariance[ring], inner = least, outer
     return covariance

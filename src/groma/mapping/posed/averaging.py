@@ -32,9 +32,10 @@ from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.gates import chi_square_gate, gate
+from groma.gates import NORMAL, chi_square_gate, gate
 from groma.geometry import quaternion
 from groma.mapping.posed.motions import Motions
+from groma.mapping.posed.noise import GROSS_ERRORS
 
 #: Columns of an inverse that are computed at a time (cost: memory).
 _COLUMNS = 256
@@ -46,19 +47,10 @@ class AveragingGates:
 
     steps: int = gate(15, "steps", "under each of the two losses", "cost: converged before")
     noise_steps: int = gate(3, "steps", "after which the noise is estimated again", "cost: it needs an inverse")
-    scale: float = gate(4.0, "sigma", "of the last loss: where a motion or a pose is doubted", "convention: four sigma")
     odd: float = gate(
-        3.0,
-        "ratio",
-        "to the median disagreement of a place with its neighbours: it starts elsewhere",
-        "convention: three",
+        3.0, "ratio", "to the median disagreement with neighbours, to start elsewhere", "convention: three"
     )
-    nearest: float = gate(
-        0.5, "share", "of the distance of two images with a parallax, which they keep", "convention: a half"
-    )
-    least_redundancy: float = gate(
-        0.05, "share", "below which a pose's residual tells nothing about its error", "convention: of geodesy"
-    )
+    nearest: float = gate(0.5, "share", "of the distance of two images with a parallax", "convention: a half")
 
 
 GATES = AveragingGates()
@@ -168,7 +160,7 @@ def _reweighted(
         if step % GATES.noise_steps:
             continue
         redundancy = np.clip(1.0 - trust / used**2 * _inverse_diagonal(system, len(values)), 0.0, 1.0)
-        counted = counts & (redundancy > GATES.least_redundancy)
+        counted = counts & (redundancy > GROSS_ERRORS.least_redundancy)
         if 2 * counted.sum() > counts.sum():  # else the given ones are too good for motions to show their noise
             squares = np.sum(own[counted] ** 2, axis=1) / redundancy[counted]
             noise = max(float(np.sqrt(np.median(squares) / chi_square_gate(0.5, 3))), 1e-9)
@@ -202,7 +194,7 @@ def _as_large(centers: FloatArray, given: FloatArray, weight: FloatArray) -> Flo
 
 
 def _geman_mcclure(ratio: FloatArray) -> FloatArray:
-    return 1.0 / (1.0 + (ratio / GATES.scale) ** 2) ** 2
+    return 1.0 / (1.0 + (ratio / NORMAL.mistake) ** 2) ** 2
 
 
 def _laplacian(first: IntArray, second: IntArray, weight: FloatArray, prior: FloatArray) -> csc_array:

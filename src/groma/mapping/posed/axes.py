@@ -35,27 +35,11 @@ _DEGREE = 111_195.0
 class AxesGates:
     """When the axes of a file are refused."""
 
-    cut: float = gate(
-        np.radians(40.0), "rad", "at which a disagreement counts no more", "convention: half a right angle"
-    )
-    better: float = gate(
-        0.5,
-        "share",
-        "of the score of the file's own reading: another that is lower is the right one",
-        "chosen on fountain-P11",
-    )
-    trusted: float = gate(
-        np.radians(10.0),
-        "rad",
-        "standard deviation up to which a direction is compared",
-        "convention: a quarter of the cut",
-    )
-    kept: float = gate(
-        0.8, "share", "of the pairs that agree best: the others may have gross errors", "convention: 10 %, twice"
-    )
-    shuffles: int = gate(
-        99, "orders", "in which the poses are given to the images at random", "cost: tells one in a hundred"
-    )
+    cut: float = gate(np.radians(40.0), "rad", "at which disagreement counts no more", "convention: half a right angle")
+    better: float = gate(0.5, "share", "of the score of the file's reading: another is right", "chosen on fountain-P11")
+    trusted: float = gate(np.radians(10.0), "rad", "of directions compared", "convention: a quarter of the cut")
+    kept: float = gate(0.8, "share", "of the pairs, those that agree best", "convention: 10 %, twice")
+    shuffles: int = gate(99, "orders", "of the poses, at random", "cost: tells one in a hundred")
     chance: float = gate(0.05, "share", "of these that may fit as well as the file's", "convention: one in twenty")
     fewest: int = gate(5, "images", "for which such a comparison tells something", "derived from 120 orders of five")
 

@@ -28,22 +28,12 @@ from groma.io.colmap.at_poses import MatchedPair
 class MotionGates:
     """How motions between two images are refined and trusted."""
 
-    noise_px: float = gate(
-        1.0, "px", "least noise of a match: SIFT's, and what calibrations slip", "convention: COLMAP"
-    )
+    noise_px: float = gate(1.0, "px", "least noise of a match: SIFT's, and calibrations'", "convention: COLMAP")
     steps: int = gate(5, "steps", "of refinement; two suffice near a solution", "cost: the joint adjustment follows")
     floor: float = gate(
-        np.radians(0.1),
-        "rad",
-        "least error of a motion: errors that neighbouring matches share",
-        "chosen on fountain-P11",
+        np.radians(0.1), "rad", "least error of a motion, which matches share", "chosen on fountain-P11"
     )
-    weakest: float = gate(
-        np.radians(20.0),
-        "rad",
-        "standard deviation from which a motion tells nothing",
-        "convention: a third of a radian",
-    )
+    weakest: float = gate(np.radians(20.0), "rad", "of a motion that tells nothing", "convention: a third of a radian")
 
 
 GATES = MotionGates()

@@ -21,22 +21,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray
-from groma.gates import gate
+from groma.gates import NORMAL, gate
 
 
 @dataclass(frozen=True)
 class GrossErrorGates:
     """When a given value is no measurement."""
 
-    false_alarm: float = gate(
-        0.01, "probability", "that a set without gross errors is found to have one", "convention: one in a hundred"
-    )
-    least_redundancy: float = gate(
-        0.05, "share", "below which a residual tells nothing about the error", "convention: of geodesy"
-    )
+    least_redundancy: float = gate(0.05, "share", "below which a residual says nothing", "convention: of geodesy")
 
 
-GATES = GrossErrorGates()
+GROSS_ERRORS = GrossErrorGates()
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +52,7 @@ def noise_of_given(squared: FloatArray, redundancy: FloatArray) -> GivenNoise:
     """
     from scipy.stats import f  # takes half a second to import
 
-    usable = np.flatnonzero(redundancy > GATES.least_redundancy)
+    usable = np.flatnonzero(redundancy > GROSS_ERRORS.least_redundancy)
     gross = np.zeros(len(squared), bool)
     if 2 * len(usable) <= np.count_nonzero(redundancy > 0.0) or len(usable) < 3:
         return GivenNoise(None, gross)
@@ -68,7 +63,7 @@ def noise_of_given(squared: FloatArray, redundancy: FloatArray) -> GivenNoise:
     half, k, variance = (count + 2) // 2, count, 0.0
     for k in range(half, count + 1):
         variance = total[k - 1] / freedom[k - 1] / _truncated(k / count)
-        if k == count or ratio[k] > 3.0 * variance * f.isf(GATES.false_alarm / count, 3, 3 * k):
+        if k == count or ratio[k] > 3.0 * variance * f.isf(NORMAL.false_alarm / count, 3, 3 * k):
             break
     if k < count:
         variance = total[k - 1] / freedom[k - 1]  # the others are none of them, and nothing was cut off

@@ -47,10 +47,7 @@ class PlacingGates:
     """How points are found at poses that are not exact yet."""
 
     tolerances_px: tuple[float, ...] = gate(
-        (24.0, 4.0),
-        "px",
-        "largest reprojection error of a point, round by round",
-        "convention: COLMAP's, before it 6 x",
+        (24.0, 4.0), "px", "largest reprojection error, round by round", "convention: COLMAP's, before it 6 x"
     )
     absolute_px: float = gate(12.0, "px", "tolerance of an image placed by points", "convention: COLMAP")
 

@@ -15,7 +15,7 @@ import numpy as np
 from groma._trees import kd_tree, nearest
 from groma._typing import FloatArray, IntArray
 from groma.estimators.membership import Candidates, memberships
-from groma.gates import chi_square_gate, gate
+from groma.gates import STRUCTURE, chi_square_gate, gate
 from groma.geometry.algebra import dot, norm, unit
 from groma.mapping.groups import distinct_pairs
 from groma.mapping.structure.relations import Landmarks, Pairs
@@ -25,18 +25,9 @@ from groma.mapping.structure.relations import Landmarks, Pairs
 class JunctionGates:
     """Which lines may meet."""
 
-    reach_px: float = gate(
-        8.0, "px", "from the end of a line to the place of meeting", "chosen on benchmarks/structure.py"
-    )
-    layer_px: float = gate(
-        8.0,
-        "px",
-        "window of distances for the mixture of meeting and passing lines",
-        "chosen on benchmarks/structure.py",
-    )
-    end_px: float = gate(
-        2.5, "px", "deviation of the end of a line from where it meets another", "chosen on benchmarks/structure.py"
-    )
+    reach_px: float = gate(8.0, "px", "from the end of a line to the place of meeting", STRUCTURE)
+    layer_px: float = gate(8.0, "px", "window of distances for the mixture of meeting and passing lines", STRUCTURE)
+    end_px: float = gate(2.5, "px", "deviation of the end of a line from where it meets another", STRUCTURE)
     most_px: float = gate(1.0, "px", "that lines that meet may miss each other", "chosen on benchmarks/structure.py")
     min_sine: float = gate(0.17, "1", "of the angle of two lines that meet", "convention: ten degrees")
     nearest: int = gate(24, "samples", "of lines that an end of a line is compared with", "cost: time of a search")

@@ -16,7 +16,7 @@ import numpy as np
 from groma._trees import kd_tree, nearest
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.association import inlier_probability
-from groma.estimators.membership import Candidates, memberships
+from groma.estimators.membership import MEMBERSHIPS, Candidates, memberships
 from groma.estimators.plane_search import BAND, PlaneSet, connected_to
 from groma.execution import map_in_threads, together
 from groma.gates import chi_square_gate, gate
@@ -35,9 +35,6 @@ class RelationGates:
     )
     line_margin: float = gate(
         0.02, "1", "of the length of a line, that points on it may be beyond", "chosen on benchmarks/surveyed.py"
-    )
-    pooled: float = gate(
-        4.0, "features", "that the share of all lines counts in that of each", "chosen on walls full of points"
     )
     neighbor: int = gate(
         8, "neighbours", "at whose distance a landmark has its surroundings", "chosen on benchmarks/surveyed.py"
@@ -268,7 +265,7 @@ def on_lines(marks: Landmarks, level: float, least: float) -> Pairs:
     near = distance < band[line]
     point, line, squared = point[near], line[near], squared[near]
     # On a wall full of points the clutter beside a line is spread over one dimension, not two.
-    probability, _ = inlier_probability(distance[near], spread[near], line, band, GATES.pooled)
+    probability, _ = inlier_probability(distance[near], spread[near], line, band, MEMBERSHIPS.pooled)
     passed = (squared < largest) & (probability > least)
     return Pairs(np.column_stack([point, line]), probability, np.zeros(len(point))).take(passed)
 

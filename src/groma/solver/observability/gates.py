@@ -16,17 +16,12 @@ _CLASSES = "chosen on the degenerate scenes of the tests"
 class DiagnosisGates:
     """What counts as not determined, as weak, and as standing out."""
 
-    undetermined: float = gate(
-        1.0, "viewing distances or rad", "standard deviation of a direction that is not determined",
-        "derived from linearity: nothing holds beyond",
-    )  # fmt: skip
+    undetermined: float = gate(1.0, "viewing distances or rad", "of what nothing determines", "derived from linearity")
     weak: float = gate(0.2, "viewing distances or rad", "standard deviation of one that is weak", _CLASSES)
     certain: float = gate(
         1e-5, "share", "a motion that costs more of what its size suggests is held", "derived from rounding"
     )
-    sample: int = gate(
-        4096, "points", "points used for the centre and extent of the scene", "cost: time of a diagnosis"
-    )
+    sample: int = gate(4096, "points", "for the centre and extent of the scene", "cost: time of a diagnosis")
     large_residual: float = gate(3.0, "ratio", "residuals of a camera that stands out, to the usual", _WORDS)
     min_residual: float = gate(1.5, "sigma", "and at least so large", _WORDS)
     few_observations: float = gate(0.1, "share", "observations of a camera that has few, of the usual", _WORDS)
@@ -38,9 +33,6 @@ class DiagnosisGates:
     near_one_place: float = gate(0.03, "viewing distances", "and hardly move, if most landmarks suffer", _CLASSES)
     parallax: float = gate(math.radians(3.0), "rad", "angle of rays that determine a point", _CLASSES)
     small_parallax: float = gate(math.radians(0.3), "rad", "the same if its residuals say so", _CLASSES)
-    discounted: float = gate(
-        5.0, "sigma", "a residual beyond: not for want of parallax", "derived from normal noise: 1 in 10^6"
-    )
     along: float = gate(math.radians(5.0), "rad", "a line runs along a motion; planes through it are one", _CLASSES)
     end_on: float = gate(math.radians(0.5), "rad", "a ray sees a line end-on", _CLASSES)
     flat: float = gate(1e-3, "share", "least extent of points on one plane, of the next", _CLASSES)
@@ -51,9 +43,7 @@ class DiagnosisGates:
     axis: float = gate(0.9995, "cosine", "a direction is called an axis of the world", _WORDS)
     takes_part: float = gate(0.05, "share", "motion of a variable in a mode, of the largest", _CLASSES)
     whole: float = gate(0.3, "share", "of the cameras in a mode: it is one of the whole", _WORDS)
-    largest_motion: float = gate(
-        100.0, "viewing distances", "motions are cut here", "derived from what is not determined"
-    )
+    largest_motion: float = gate(100.0, "viewing distances", "motions are cut here", "derived from undetermined ones")
     one_by_one: int = gate(4, "variables", "described one by one; of more the names are listed", _WORDS)
     edge_on: float = gate(0.03, "share", "a camera so near to a plane sees it edge-on", _CLASSES)
     named: float = gate(0.1, "share", "motion of a parameter that is named, of the largest", _WORDS)

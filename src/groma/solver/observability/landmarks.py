@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.gates import NORMAL
 from groma.solver.linear.visible_motion import Observers, nearest_place
 from groma.solver.observability.findings import Finding, few, first_upper
 from groma.solver.observability.gates import DIAGNOSIS
@@ -91,7 +92,7 @@ def _point_findings(landmarks: _Landmarks) -> tuple[list[Finding], BoolArray]:
     angle = _parting(inspection, name, landmarks.alone | rest | landmarks.unseen, landmarks.seen)
     apart = angle > DIAGNOSIS.parallax
     if rest.any():
-        apart |= (angle > DIAGNOSIS.small_parallax) & (inspection.worst_residuals(name, rest) > DIAGNOSIS.discounted)
+        apart |= (angle > DIAGNOSIS.small_parallax) & (inspection.worst_residuals(name, rest) > NORMAL.sure)
     findings = landmarks.finding(
         "point_seen_once", "problem", landmarks.alone,
         "is seen by one camera only: its depth is not determined",

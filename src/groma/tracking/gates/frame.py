@@ -14,12 +14,7 @@ SEQUENCES = "chosen on cabinet, redkitchen and KITTI 06"
 class CheckGates:
     """Frames that are of no use."""
 
-    min_contrast: float = gate(
-        4.0,
-        "grey levels",
-        "images whose grey levels spread less show nothing",
-        "derived from the noise of 8-bit images",
-    )
+    min_contrast: float = gate(4.0, "grey levels", "images that spread less are blank", "derived from noise of 8 bits")
     sparse_depth: float = gate(
         0.2, "share", "depth images with fewer known depths are reported", "convention: a sentence for the reader only"
     )
@@ -56,10 +51,7 @@ class DepthGates:
     """Depth images: noise, and where the depth beside a segment is read."""
 
     inverse_sigma: float = gate(
-        0.003,
-        "1 / scene unit",
-        "noise of an inverse depth: 3 mm at 1 m, 12 mm at 2 m",
-        "derived from Kinect disparities",
+        0.003, "1 / scene unit", "of inverse depth: 3 mm at 1 m", "derived from Kinect disparities"
     )
     min_sigma: float = gate(0.003, "scene units", "a depth is not known better", "derived from millimetres in files")
     near: float = gate(0.5, "px", "depth beside a segment is read from this distance on", SEQUENCES)
@@ -145,33 +137,15 @@ class RectificationGates:
     min_keyframes: int = gate(
         2, "keyframes", "keyframes at which angles are first estimated", "cost: rows alone before"
     )
-    max_step: float = gate(
-        0.22,
-        "share",
-        "of the depth between keyframes; patches that grow by more slide",
-        "chosen on KITTI 06, strides 1 to 3",
-    )
+    max_step: float = gate(0.22, "share", "of the depth between keyframes: patches slide", "chosen on KITTI 06")
     min_columns: int = gate(100, "points", "columns that tell yaw", "derived from thirty in each of two pairs, twice")
-    min_views: int = gate(
-        4,
-        "keyframes",
-        "see a point whose columns count: wrong tracks agree with any yaw",
-        "chosen on KITTI 06, strides 1 to 3",
-    )
+    min_views: int = gate(4, "keyframes", "that see a point whose columns count", "chosen on KITTI 06")
     max_iterations: int = gate(50, "steps", "steps of the adjustment that tells yaw", "cost: converges in fewer")
-    growth: float = gate(
-        1.5, "ratio", "angles are estimated anew when so many more keyframes tell them", "cost: adds up"
-    )
+    growth: float = gate(1.5, "ratio", "of keyframes, at which angles are estimated anew", "cost: adds up")
     as_sure: float = gate(
-        1.5, "ratio", "of variances of yaw, up to which the estimate from more keyframes is the better one",
-        "derived from variances estimated from 15 cells: they differ by a half",
-    )  # fmt: skip
-    start_over: float = gate(
-        0.3,
-        "px",
-        "with a larger error in the right image the first landmarks are not worth keeping",
-        "chosen on KITTI 06",
+        1.5, "ratio", "of variances of yaw that count as equal", "derived from 15 cells: they differ by a half"
     )
+    start_over: float = gate(0.3, "px", "error in the right image; first landmarks are not kept", "chosen on KITTI 06")
     matters: float = gate(0.05, "px", "a smaller change in the right image is not worth adjusting anew", "cost: time")
 
 

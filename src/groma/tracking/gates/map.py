@@ -103,10 +103,7 @@ class LandmarkPlaneGates:
     """Planes in the points and lines of a map without depth images."""
 
     surface_sigmas_px: tuple[float, ...] = gate(
-        (0.2, 0.8, 3.2),
-        "px",
-        "deviations of surfaces that are tried",
-        "derived from that of photographs, times 1, 4 and 16",
+        (0.2, 0.8, 3.2), "px", "deviations of surfaces that are tried", "derived from photographs, x 1, 4, 16"
     )
     min_views: int = gate(
         2, "images", "that see a landmark (a stereo pair is two); it was followed between them", SEQUENCES

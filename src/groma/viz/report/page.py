@@ -32,6 +32,7 @@ from groma.scene.checks import check_scene_given
 from groma.viz.drawable import Drawable, drawable
 from groma.viz.pack import script_json
 from groma.viz.pictures import ImageFiles
+from groma.viz.report import charts as _charts
 from groma.viz.report import tables as _page_tables
 from groma.viz.report.covariances import LandmarkCovariances
 from groma.viz.report.data import scene_data
@@ -136,7 +137,7 @@ def write_report(
     scenes = [scene for scene in (scene_before, scene_after) if scene is not None]
     states = [state for state in (before, after) if state is not None]
     numbers = report.to_dict() if report is not None else None
-    history = [step for step in report.history if _iteration(step) > 0] if report is not None else None
+    history = [step for step in report.history if _charts.entry(step)["iteration"] > 0] if report is not None else None
     said = contents or PageContents()
     sentences = said.warnings if said.warnings is not None else report.warnings if report is not None else ()
     diagnosis = said.diagnosis
@@ -159,7 +160,7 @@ def write_report(
             scene_after, before, after, history, _stages(numbers), said.outcomes, said.explanation
         ),
         "TABLES": _page_tables.number_tables(scene_after, before, after, numbers),
-        "FOOTER": _footer(),
+        "FOOTER": f"Written by groma {__version__}. Pixels: the centre of the first pixel is (0.5, 0.5).",
         "DATA": script_json(of_scene() | image_data(scene_after, held, states, photographs)),
         "SCRIPT": script,
     }
@@ -194,17 +195,9 @@ def _lead(scene: Scene, shown: Drawable, report: Report | None) -> str:
     return f'<p class="lead">{html.escape(first)}</p>'
 
 
-def _iteration(step: Any) -> int:
-    return int(step["iteration"] if isinstance(step, Mapping) else step.iteration)
-
-
 def _stages(numbers: Mapping[str, Any] | None) -> list[dict[str, Any]]:
     """Return the stages of an adjustment; a single one if the report does not list them."""
     if numbers is None:
         return []
     whole = {"loss": "", "initial_cost": numbers["initial_cost"], "first_step": 1}
     return [{**whole, **stage} for stage in numbers.get("stages") or [whole]]
-
-
-def _footer() -> str:
-    return f"Written by groma {__version__}. Pixels: the centre of the first pixel is (0.5, 0.5)."

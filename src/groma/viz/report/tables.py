@@ -41,6 +41,13 @@ _OUTCOMES = {
     "texture": ("texture", "#b5a7d6"),
     "repeated": ("repeats another line", "#7fb3a6"),
 }
+#: Statistics of residuals, by what the tables call them.
+_STATISTICS: dict[str, Callable[[FloatArray], Any]] = {
+    "rms": lambda values: np.sqrt(np.mean(values**2)),
+    "median": np.median,
+    "95 of 100 below": lambda values: np.percentile(values, 95),
+    "largest": np.max,
+}
 
 
 def counts_of(scene: Scene, shown: Drawable) -> list[tuple[str, int]]:
@@ -62,18 +69,12 @@ def words(counts: Sequence[tuple[str, int]]) -> str:
 
 def tiles(scene: Scene, before: Drawable | None, after: Drawable, numbers: Mapping[str, Any] | None) -> str:
     """Return the most important numbers in large letters."""
-
-    def change(first: float | None, second: float, unit: str) -> str:
-        return " <i>→</i> ".join(_digits.short([second] if first is None else [first, second])) + unit
-
-    def summary(statistic: Callable[[FloatArray], float], kind: int) -> str:
-        values = [None if state is None else statistic(_of_kind(state, kind)) for state in (before, after)]
-        return change(values[0], values[1] if values[1] is not None else float("nan"), " px")
-
+    states = [state for state in (before, after) if state is not None]
     cells = []
     for kind, name in enumerate(after.residual_kinds):
-        if len(_known(_of_kind(after, kind))):
-            cells.append((summary(_median, kind), f"residual of {name}, median"))
+        if len(_known(after, kind)):
+            medians = _digits.short([_statistic("median", _known(state, kind)) for state in states])
+            cells.append((" <i>→</i> ".join(medians) + " px", f"residual of {name}, median"))
     for name, told in ((numbers or {}).get("inliers") or {}).items():
         share = [100.0 * told["share"]["before"]] if before is not None else []
         share = _digits.short([*share, 100.0 * told["share"]["after"]])
@@ -81,7 +82,12 @@ def tiles(scene: Scene, before: Drawable | None, after: Drawable, numbers: Mappi
     if numbers is not None:
         cells.append((f"{numbers['iterations']}", "steps"))
     cells += [(f"{count:,}", name) for name, count in counts_of(scene, after) if count][: 5 - len(cells)]
-    return "".join(f'<div class="tile"><b>{value}</b><span>{label}</span></div>' for value, label in cells)
+    return as_tiles(cells)
+
+
+def as_tiles(cells: Sequence[tuple[str, str]]) -> str:
+    """Return values, which are HTML, each above its label."""
+    return "".join(f'<div class="tile"><b>{value}</b><span>{html.escape(label)}</span></div>' for value, label in cells)
 
 
 def chart_cards(
@@ -99,9 +105,9 @@ def chart_cards(
         key = '<span class="key" style="--c:var(--before)">before</span>' + key
     cards = []
     for kind, name in enumerate(after.residual_kinds):
-        lengths = _known(_of_kind(after, kind))
+        lengths = _known(after, kind)
         if len(lengths):
-            earlier = _known(_of_kind(before, kind)) if before is not None else None
+            earlier = _known(before, kind) if before is not None else None
             caption = f"Share of {len(lengths):,} residuals by magnitude, on a logarithmic axis. {key}"
             cards.append((f"Residuals of {name}", caption, _charts.histogram(earlier, lengths)))
     if history is not None:
@@ -162,9 +168,7 @@ def diagnosis_card(diagnosis: Mapping[str, Any] | None) -> str:
         [name.replace("_", " "), *(f"{counts[key]:,}" for key in ("determined", "weak", "undetermined"))]
         for name, counts in diagnosis.get("observability", {}).items()
     ]
-    head = "".join(f"<th>{cell}</th>" for cell in ("", "determined", "weak", "not determined"))
-    body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-    counts = f'<div class="wide"><table><tr>{head}</tr>{body}</table></div>' if rows else ""
+    counts = _table(["", "determined", "weak", "not determined"], rows) if rows else ""
     caption = (
         "Red: not determined, the standard deviation exceeds the viewing distance (or a radian). Yellow: weak, or odd. "
         "The table takes the cameras as known."
@@ -233,11 +237,11 @@ def _residual_table(before: Drawable | None, after: Drawable) -> str:
     states = [state for state in (before, after) if state is not None]
     rows = []
     for kind, name in enumerate(after.residual_kinds):
-        picked = [_known(_of_kind(state, kind)) for state in states]
+        picked = [_known(state, kind) for state in states]
         if not len(picked[-1]):
             continue
-        for label, function in (("rms", _rms), ("median", _median), ("95 of 100 below", _high), ("largest", _largest)):
-            rows.append([f"{name}, {label}", *(f"{_digits.fixed(function(values))} px" for values in picked)])
+        for label in _STATISTICS:
+            rows.append([f"{name}, {label}", *(f"{_digits.fixed(_statistic(label, values))} px" for values in picked)])
     unseen = [int(np.isnan(state.lengths).sum()) for state in states]
     if any(unseen):
         rows.append(["not visible from their camera", *(f"{count:,}" for count in unseen)])
@@ -265,7 +269,7 @@ def _plane_table(scene: Scene, after: Drawable) -> str:
         far = places @ hesse[:3] + hesse[3]
         rows.append([f"{scene.planes.ids[plane]}", f"{len(points):,}", f"{len(lines):,}"])
         areas.append(patch_area(after.patches[plane]) if len(places) >= 3 else float("nan"))
-        far_off.append(_rms(far))
+        far_off.append(_statistic("rms", far[np.isfinite(far)]))
     for row, area, far in zip(rows, _digits.even(areas), _digits.even(far_off), strict=True):
         row += [area, far]
     marks = [_colours.css(colours[plane]) for plane in order]
@@ -340,25 +344,11 @@ def _track_lengths(scene: Scene) -> dict[str, IntArray]:
     return {kind: count[count > 0] for kind, count in counts.items() if count.any()}
 
 
-def _of_kind(shown: Drawable, kind: int) -> FloatArray:
-    return shown.lengths[shown.residual_kind == kind]
-
-
-def _known(lengths: FloatArray) -> FloatArray:
+def _known(shown: Drawable, kind: int) -> FloatArray:
+    """Return the lengths of the residuals of a kind, where they are known."""
+    lengths = shown.lengths[shown.residual_kind == kind]
     return lengths[np.isfinite(lengths)]
 
 
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(known**2))) if len(known := _known(values)) else float("nan")
-
-
-def _median(values: FloatArray) -> float:
-    return float(np.median(known)) if len(known := _known(values)) else float("nan")
-
-
-def _high(values: FloatArray) -> float:
-    return float(np.percentile(known, 95)) if len(known := _known(values)) else float("nan")
-
-
-def _largest(values: FloatArray) -> float:
-    return float(known.max()) if len(known := _known(values)) else float("nan")
+def _statistic(name: str, values: FloatArray) -> float:
+    return float(_STATISTICS[name](values)) if len(values) else float("nan")

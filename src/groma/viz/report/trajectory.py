@@ -9,7 +9,6 @@ from the side, its error over time if there is a reference, the features tracked
 
 from __future__ import annotations
 
-import html
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
@@ -169,7 +168,7 @@ def _tiles(track: Track, scores: TrajectoryScores | None) -> str:
         median, high = _digits.even([total["median"], total["p95"]])
         cells.append((f"{median} ms", f"per frame, median; 95 of 100 below {high} ms"))
     cells += [(f"{len(track.keyframes):,}", "keyframes"), (f"{numbers.get('loops', 0):,}", "loops closed")]
-    return "".join(f'<div class="tile"><b>{value}</b><span>{html.escape(label)}</span></div>' for value, label in cells)
+    return _page_tables.as_tiles(cells)
 
 
 def _path_cards(track: Track, scores: TrajectoryScores | None) -> str:
@@ -177,13 +176,11 @@ def _path_cards(track: Track, scores: TrajectoryScores | None) -> str:
     times, poses = track.trajectory.timestamps, track.trajectory.world_from_cam
     if not len(poses):
         return ""
-    curves = [("estimate", "var(--after)", times, poses)]
     if scores is not None:
         poses = apply_similarity(scores.similarity, poses)
-        curves = [
-            ("estimate", "var(--after)", times, poses),
-            ("reference", "var(--before)", scores.timestamps, scores.reference),
-        ]
+    curves = [("estimate", "var(--after)", times, poses)]
+    if scores is not None:
+        curves.append(("reference", "var(--before)", scores.timestamps, scores.reference))
     turn = quaternion.to_matrix(poses[:, :4])
     up = upward(turn[:, :, 1])
     axes = _axes(poses[:, 4:], up)
@@ -239,10 +236,9 @@ def _time_cards(track: Track, frames: Sequence[Frame], scores: TrajectoryScores 
     order = np.argsort(times, kind="stable")
     times, frames = times[order], [frames[k] for k in order]
     status = np.array([frame.status for frame in frames])
-    bands = [(times[status == key], colour) for key, (_, colour) in _STATUSES.items() if (status == key).any()]
-    marked = legend(
-        [Curve(words, colour, times) for key, (words, colour) in _STATUSES.items() if (status == key).any()]
-    )
+    marks = [(times[status == key], *of_status) for key, of_status in _STATUSES.items() if (status == key).any()]
+    bands = [(when, colour) for when, _, colour in marks]
+    marked = legend([Curve(words, colour, when) for when, words, colour in marks])
     curves = []
     for kind, colour in _KINDS.items():
         counts = np.array([frame.counts.get(kind, 0) for frame in frames], dtype=float)

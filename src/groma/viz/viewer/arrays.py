@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -46,6 +46,22 @@ def add_segments(
     return server.scene.add_line_segments(
         name, segments.astype(np.float32), ends, thickness=width, thickness_units="screen", visible=visible
     )
+
+
+def add_dots(
+    server: viser.ViserServer,
+    name: str,
+    places: FloatArray,
+    colours: Colours,
+    size: float,
+    visible: bool = True,
+    shape: Literal["circle", "diamond"] = "circle",
+) -> Any:
+    """Add dots (N, 3) with colours (N, 3) or (3,), as large as given in the units of the page."""
+    return server.scene.add_point_cloud(
+        name, places.astype(np.float32), np.ascontiguousarray(np.broadcast_to(colours, places.shape), np.uint8),
+        point_size=size, point_shape=shape, point_shading="flat", precision="float32", visible=visible,
+    )  # fmt: skip
 
 
 def add_patches(

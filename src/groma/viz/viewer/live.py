@@ -185,12 +185,10 @@ class LiveView:
         self._size = max(float(np.linalg.norm(high - low)), 1e-3)
         shown, nodes = {name: box.value for name, box in self.shown.items()}, self._nodes
         with self.server.atomic():
-            nodes["points"] = [self.server.scene.add_point_cloud(
-                "/points", scene.points.xyz.astype(np.float32),
-                np.tile(np.array(_POINTS, np.uint8), (scene.num_points, 1)),
-                point_size=0.004 * self._size, point_shape="circle", precision="float32",
-                visible=shown["points"],
-            )]  # fmt: skip
+            colour, size = np.array(_POINTS, np.uint8), 0.004 * self._size
+            nodes["points"] = [
+                _view_arrays.add_dots(self.server, "/points", scene.points.xyz, colour, size, shown["points"])
+            ]
             self.server.scene.remove_by_name("/lines")
             nodes["lines"] = []
             if scene.num_lines:

@@ -164,15 +164,9 @@ class SceneView:
                 return
             self._drawn_points = wanted
             number, mode = wanted
-            self.points = self.server.scene.add_point_cloud(
-                "/points",
-                self.content.points[:number].astype(np.float32),
-                self.content.point_colours[mode][:number],
-                point_size=self._point_size(),
-                point_shape="circle",
-                point_shading="flat",
-                precision="float32",
-                visible=self.shown["points"].value,
+            places, colours = self.content.points[:number], self.content.point_colours[mode][:number]
+            self.points = _view_arrays.add_dots(
+                self.server, "/points", places, colours, self._point_size(), self.shown["points"].value
             )
 
     def draw_lines(self) -> None:
@@ -259,17 +253,9 @@ class SceneView:
         """A dot where two lines meet."""
         places = self.content.junctions
         if len(places):
+            colour, size = np.array(_JUNCTION, np.uint8), _JUNCTION_SIZE * REACH
             self._nodes["junctions"].append(
-                self.server.scene.add_point_cloud(
-                    "/junctions",
-                    places.astype(np.float32),
-                    np.tile(np.array(_JUNCTION, np.uint8), (len(places), 1)),
-                    point_size=_JUNCTION_SIZE * REACH,
-                    point_shape="diamond",
-                    point_shading="flat",
-                    precision="float32",
-                    visible=False,
-                )
+                _view_arrays.add_dots(self.server, "/junctions", places, colour, size, False, "diamond")
             )
 
     def _point_size(self) -> float:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import BoolArray, IntArray
-from groma.gates import gate
+from groma.gates import LINE_MAPS, gate
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.linking.growth import near_lines, votes_for_same
 from groma.mapping.lines.linking.merge import seen_apart
@@ -26,9 +26,7 @@ from groma.mapping.lines.linking.tracks import Tracks
 class DuplicateGates:
     """When a line is explained by another one."""
 
-    min_ratio: float = gate(
-        2.0, "1", "times as many images has a line that only runs near the segments", "chosen on benchmarks/lines.py"
-    )
+    min_ratio: float = gate(2.0, "1", "images of a line that only runs near, over its own", LINE_MAPS)
 
 
 GATES = DuplicateGates()

@@ -26,16 +26,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.gates import gate
+from groma.gates import LINE_MAPS, gate
 
 
 @dataclass(frozen=True)
 class KindGates:
     """What is asked of the kind of a line's segments, beside ``MapLinesOptions.min_repeatability``."""
 
-    top_share: float = gate(
-        0.6, "1", "asked at most, over what the best kind of segment reaches", "chosen on benchmarks/lines.py"
-    )
+    top_share: float = gate(0.6, "1", "asked at most, over what the best kind reaches", LINE_MAPS)
     top_quantile: float = gate(0.9, "quantile", "of p that stands for the best kind", "chosen on benchmarks/lines.py")
 
 

@@ -29,7 +29,7 @@ import scipy  # its parts are imported when something of them is first used
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_in_threads
-from groma.gates import gate
+from groma.gates import LINE_MAPS, gate
 from groma.mapping.lines.filtering.kinds import features_of
 from groma.mapping.lines.linking.tracks import Tracks
 
@@ -38,27 +38,14 @@ from groma.mapping.lines.linking.tracks import Tracks
 class TextureGates:
     """The two populations, and the priors."""
 
-    edge: tuple[float, float] = gate(
-        (0.6, 6.0),
-        "1",
-        "mean and concentration of the rate at which images show an edge",
-        "chosen on benchmarks/lines.py",
-    )
-    texture: tuple[float, float] = gate(
-        (0.22, 15.0), "1", "the same of a line of texture", "chosen on benchmarks/lines.py"
-    )
+    edge: tuple[float, float] = gate((0.6, 6.0), "1", "mean and concentration of how often an edge shows", LINE_MAPS)
+    texture: tuple[float, float] = gate((0.22, 15.0), "1", "the same of a line of texture", LINE_MAPS)
     line_shares: tuple[float, float] = gate(
-        (0.06, 0.35),
-        "share",
-        "of what texture, and edges, give that becomes a line: middle of the prior",
-        "chosen on benchmarks/lines.py",
+        (0.06, 0.35), "share", "of texture, and of edges, that becomes a line: middle of the prior", LINE_MAPS
     )
     share_sigma: float = gate(0.5, "log odds", "deviation of the prior of the shares", "chosen on benchmarks/lines.py")
     weight_sigma: tuple[float, float] = gate(
-        (10.0, 1.5),
-        "log odds",
-        "deviations of the priors of the first weight and of the others",
-        "convention: wide priors",
+        (10.0, 1.5), "log odds", "of the priors of the first weight and of the others", "convention: wide priors"
     )
 
 

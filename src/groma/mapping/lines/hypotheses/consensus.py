@@ -20,7 +20,7 @@ import numpy as np
 from groma._numba import inline_kernel, kernel, loop
 from groma._ordering import ascending
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.gates import gate
+from groma.gates import LINE_MAPS, gate
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.hypotheses.proposals import Proposals
 
@@ -33,12 +33,7 @@ class ConsensusGates:
         3, "proposals", "per segment that are fused with what agrees, and compared", "cost: the best is among the first"
     )
     fusing_rounds: int = gate(3, "rounds", "of fusing and comparing again", "cost: the second changes little")
-    half_weight: float = gate(
-        4.0,
-        "sigma^2",
-        "squared distance at which a proposal counts half in the fused place",
-        "chosen on benchmarks/lines.py",
-    )
+    half_weight: float = gate(4.0, "sigma^2", "squared distance at which a proposal counts half", LINE_MAPS)
 
 
 GATES = ConsensusGates()

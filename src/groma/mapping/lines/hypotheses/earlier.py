@@ -28,14 +28,9 @@ from groma.scene import Scene
 class EarlierGates:
     """When two images have moved."""
 
-    num_points: int = gate(
-        100, "points", "of an image that tell how far its epipolar lines moved", "cost: of a quantile"
-    )
+    num_points: int = gate(100, "points", "of an image that tell how its epipolar lines moved", "cost: of a quantile")
     moved_share: float = gate(
-        0.1,
-        "share",
-        "of the points whose epipolar line moved by more than noise: search again",
-        "chosen on castle, fountain",
+        0.1, "share", "of points whose epipolar line moved: search again", "chosen on castle, fountain"
     )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray, IntArray
-from groma.gates import gate
+from groma.gates import LINE_MAPS, gate
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.views import LineViews
 
@@ -27,12 +27,8 @@ _MAX_POINTS = 16
 class KnownPointGates:
     """Which points lie on a segment, and agree."""
 
-    max_distance: float = gate(
-        2.0, "px", "of a point from a segment, across it and beyond its ends", "chosen on benchmarks/lines.py"
-    )
-    tolerance: float = gate(
-        0.01, "1", "relative difference of inverse depths that agree", "chosen on benchmarks/lines.py"
-    )
+    max_distance: float = gate(2.0, "px", "of a point from a segment, across and beyond", LINE_MAPS)
+    tolerance: float = gate(0.01, "1", "relative difference of inverse depths", LINE_MAPS)
 
 
 GATES = KnownPointGates()

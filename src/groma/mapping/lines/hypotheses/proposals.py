@@ -32,7 +32,7 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.gates import gate
+from groma.gates import LINE_MAPS, gate
 from groma.geometry.algebra import perpendicular
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.hypotheses.known_points import lines_through_points
@@ -52,12 +52,7 @@ _ROOM = 64
 class ProposalGates:
     """Which pairs of segments propose a place."""
 
-    end_margin: float = gate(
-        2.0,
-        "1",
-        "factor by which the ends of a segment may leave the range of depths of its middle",
-        "chosen on benchmarks/lines.py",
-    )
+    end_margin: float = gate(2.0, "1", "by which ends may leave the depths of the middle", LINE_MAPS)
 
     def limits(self) -> tuple[float, float, float]:
         """Least change over the range of depths, margin of the ends, squared disagreement with a direction."""

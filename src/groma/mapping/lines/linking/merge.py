@@ -37,12 +37,7 @@ from groma.mapping.lines.outcomes import Outcome
 class MergeGates:
     """When two lines are one."""
 
-    pose_px: tuple[float, float] = gate(
-        (0.3, 2.5),
-        "px",
-        "bounds of the deviation that poses add",
-        "chosen on fountain, herz: the upper one says nothing there",
-    )
+    pose_px: tuple[float, float] = gate((0.3, 2.5), "px", "deviation that poses add", "chosen on fountain, herz")
     min_pairs: int = gate(5, "pairs", "fewer do not tell the deviation of the poses", "chosen on synthetic wireframes")
     max_distance: float = gate(8.0, "px", "between lines that are compared", "chosen on fountain, herz")
     max_angle: float = gate(0.2, "rad", "between lines that are compared", "chosen on fountain, herz")

@@ -13,7 +13,7 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.line_ends import SegmentRays, trim
 from groma.execution import map_ranges
-from groma.gates import gate
+from groma.gates import LINE_MAPS, gate
 from groma.mapping.groups import grouped
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.linking.fit import fit_lines
@@ -33,20 +33,15 @@ class TrackGates:
     )
 
     min_overlap_px: float = gate(
-        5.0, "px", "shortest projection of a line, and shortest overlap with a segment", "chosen on benchmarks/lines.py"
+        5.0, "px", "shortest projection of a line, and shortest overlap with a segment", LINE_MAPS
     )
-    min_common_images: int = gate(
-        2, "images", "images that show that two lines are one", "chosen on benchmarks/lines.py"
-    )
+    min_common_images: int = gate(2, "images", "images that show that two lines are one", LINE_MAPS)
     min_observations: int = gate(
         4, "observations", "of a line whose residuals tell the noise", "derived from two of four numbers being left"
     )
     min_residuals: int = gate(30, "observations", "fewer tell nothing of the noise", "derived from 10 % of its error")
     noise_quantile: float = gate(
-        0.75,
-        "quantile",
-        "of the residuals, compared with that of normal ones",
-        "chosen on benchmarks/lines.py: tails are heavy",
+        0.75, "quantile", "of the residuals, over that of normal ones", "chosen on benchmarks/lines.py: tails are heavy"
     )
 
 
