@@ -13,6 +13,7 @@ from groma.adjustment.survey.place import settled
 from groma.adjustment.survey.reliability import reliability
 from groma.evaluation import evaluate_poses
 from groma.geometry import so3
+from groma.scene import Similarity
 from groma.scene.measurements import PosePriors
 from groma.scene.survey import CameraPositions, Distances, Kind, KnownDirections, diagonal_covariance
 from groma.scene.synthetic import holistic
@@ -88,3 +89,17 @@ def test_a_scene_is_placed_at_its_poses_which_stay():
     for one in (away, away.replace(camera_positions=rough)):
         np.testing.assert_allclose(settled(one).cam_from_world, scene.cam_from_world, atol=1e-5)
         np.testing.assert_array_equal(settled(one).pose_priors.rig_from_world, scene.pose_priors.rig_from_world)
+
+
+@pytest.mark.kernels
+def test_a_scene_is_placed_where_its_rough_poses_fit_best():
+    """Pixels do not notice that it is turned and shifted as a whole, and rough poses weigh little beside them."""
+    truth, scene = _at_poses(5.0)
+    turned = scene.transformed(Similarity(1.0, so3.exp(np.array([[0.0, 0.02, 0.01]]))[0], np.array([0.3, 0.0, 0.1])))
+    turned = turned.replace(pose_priors=scene.pose_priors)
+    found = groma.adjust(turned, groma.AdjustOptions(loss="none", max_iterations=3)).scene
+    off = settled(found).cam_centers_in_world - found.cam_centers_in_world
+    assert np.abs(off).max() < 1e-5
+    np.testing.assert_allclose(found.cam_centers_in_world, truth.cam_centers_in_world, atol=0.02)
+    held = groma.adjust(turned, groma.AdjustOptions(loss="none", max_iterations=3, refine_poses=False)).scene
+    np.testing.assert_array_equal(held.frames.rig_from_world, turned.frames.rig_from_world)
