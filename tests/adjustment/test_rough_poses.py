@@ -9,10 +9,12 @@ import pytest
 import groma
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
-from groma.adjustment.survey.place import settled
+from groma.adjustment.survey.place import moved, settled
 from groma.adjustment.survey.reliability import reliability
 from groma.evaluation import evaluate_poses
+from groma.factors import SegmentOnPlane
 from groma.geometry import so3
+from groma.problem.gauge import world_motions
 from groma.scene import Similarity
 from groma.scene.measurements import PosePriors
 from groma.scene.survey import CameraPositions, Distances, Kind, KnownDirections, diagonal_covariance
@@ -103,3 +105,17 @@ def test_a_scene_is_placed_where_its_rough_poses_fit_best():
     np.testing.assert_allclose(found.cam_centers_in_world, truth.cam_centers_in_world, atol=0.02)
     held = groma.adjust(turned, groma.AdjustOptions(loss="none", max_iterations=3, refine_poses=False)).scene
     np.testing.assert_array_equal(held.frames.rig_from_world, turned.frames.rig_from_world)
+
+
+def test_segments_on_planes_do_not_tell_where_a_scene_is():
+    """Where it may move as a whole, the places on them move with it: a line askew would draw it along the line."""
+    made = holistic(8, 3, noise_px=0.5)
+    poses = made.start.frames.rig_from_world
+    priors = PosePriors(np.arange(len(poses)), poses, np.tile([5.0] * 3 + [1.0] * 3, (len(poses), 1)))
+    for scene, moves in ((made.start.replace(pose_priors=priors), True), (made.start, False)):
+        problem = assemble(scene, AssemblyOptions()).problem
+        (factor,) = (one for one in problem.factors if isinstance(one, SegmentOnPlane))
+        assert (factor.frame is not None) is moves
+        motions = {name: part.transpose(1, 2, 0) for name, part in world_motions(problem, np.zeros(3), 1.0).items()}
+        told = np.abs(moved(motions, factor, problem)[:, :, :6]).max()
+        assert told < 1e-10 if moves else told > 1e-3
