@@ -11,6 +11,8 @@ from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.survey.place import moved, settled
 from groma.adjustment.survey.reliability import reliability
+from groma.adjustment.terms.camera_poses import held_scale
+from groma.adjustment.uncertainty import uncertainty
 from groma.evaluation import evaluate_poses
 from groma.factors import SegmentOnPlane
 from groma.geometry import so3
@@ -19,6 +21,7 @@ from groma.scene import Similarity
 from groma.scene.measurements import PosePriors
 from groma.scene.survey import CameraPositions, Distances, Kind, KnownDirections, diagonal_covariance
 from groma.scene.synthetic import holistic
+from groma.solver.covariance.quantities import distance_between_cameras
 
 
 def _at_poses(sigma):
@@ -119,3 +122,28 @@ def test_segments_on_planes_do_not_tell_where_a_scene_is():
         motions = {name: part.transpose(1, 2, 0) for name, part in world_motions(problem, np.zeros(3), 1.0).items()}
         told = np.abs(moved(motions, factor, problem)[:, :, :6]).max()
         assert told < 1e-10 if moves else told > 1e-3
+
+
+@pytest.mark.kernels
+@pytest.mark.parametrize("sigma", [0.5, 2.0])
+def test_a_held_scale_is_as_uncertain_as_measurements_leave_it(sigma):
+    """Positions with the deviation s at places x tell its logarithm to s / sqrt(sum |x - mean|^2), beside images that
+    are far more exact; and what they tell of shift and turn is untouched.
+    """
+    scene = _at_positions(sigma)
+    found = uncertainty(scene)
+    assert found.gauge == "measured" and held_scale(found.covariances.problem) is not None
+    centers = scene.cam_centers_in_world
+    away = centers - centers.mean(axis=0)
+    of_scale = sigma / np.sqrt(np.sum(away**2))
+    for second in (3, 5):
+        apart = distance_between_cameras(found.covariances, ("frames", 0), ("frames", second))
+        assert apart.sigma == pytest.approx(of_scale * apart.value, rel=0.02)
+    # Of each centre: a shift s / sqrt(n), turns by the inverse of their information, and the scale.
+    turns = sigma**2 * np.linalg.inv(np.sum(away**2) * np.eye(3) - away.T @ away)
+    hat = np.cross(away[:, None, :], np.eye(3)).swapaxes(1, 2)
+    expected = sigma**2 / len(away) * np.eye(3) + hat @ turns @ np.swapaxes(hat, 1, 2)
+    expected = expected + of_scale**2 * away[:, :, None] * away[:, None, :]
+    np.testing.assert_allclose(found.centers, expected, atol=0.02 * sigma**2)
+    places = found.covariances.of_coordinates("points")
+    assert np.isfinite(places).all() and np.linalg.eigvalsh(places).min() > 0.0
