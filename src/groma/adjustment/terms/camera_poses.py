@@ -93,7 +93,7 @@ def _held_scale(draft: Draft) -> Iterator[Group]:
     if scene.is_metric or not (told and options.planes and options.refine_poses and options.structure_form == "metric"):
         return
     information = _information_on_scale(scene)
-    num_lengths = len(scene.relations.point_on_plane) + 2 * len(scene.relations.line_on_plane)
+    num_lengths = lengths_on_planes(scene) if options.num_lengths is None else options.num_lengths
     centers = se3.inverse(scene.frames.rig_from_world)[:, 4:]
     apart = np.linalg.norm(centers - centers[0], axis=1)
     if num_lengths <= GATES.max_shrinkage * information or apart.max() == 0.0:
@@ -114,6 +114,11 @@ def _held_scale(draft: Draft) -> Iterator[Group]:
             sqrt_information=(num_lengths / GATES.max_shrinkage) ** 0.5 / apart[far],
         )
     )
+
+
+def lengths_on_planes(scene: Scene) -> int:
+    """Return how many lengths relations with planes compare with zero."""
+    return len(scene.relations.point_on_plane) + 2 * len(scene.relations.line_on_plane)
 
 
 def held_scale(problem: Problem) -> Factor | None:
