@@ -142,8 +142,9 @@ def _factors(draft: Draft) -> Iterator[Group]:
 
 def _ends(draft: Draft, lines: IntArray) -> dict[str, Any]:
     """Return the ends of segments: where the whole scene may move, in the frame of a camera that moves with it."""
-    scene, ends = draft.scene, draft.scene.lines.segments[lines]
-    if not (draft.options.refine_poses and (draft.options.gauge == "free" or scene.is_tied)):
+    scene, ends, options = draft.scene, draft.scene.lines.segments[lines], draft.options
+    moves = options.refine_poses and options.held_frames is None
+    if not (moves and (options.gauge == "free" or scene.is_tied)):
         return {"ends": ends}
     table, frame = scene.line_observations, np.zeros(scene.num_lines, np.int64)
     frame[table.line_idx] = scene.images.frame_idx[table.image_idx]  # any that sees the line
