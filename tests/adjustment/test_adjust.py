@@ -5,8 +5,10 @@ import warnings
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from groma.adjustment.adjust import AdjustOptions, adjust
+from groma.adjustment.terms.contract import Term
 from groma.errors import InputError, ProblemError
 from groma.evaluation.poses import evaluate_poses
 from groma.scene import Relations
@@ -194,3 +196,23 @@ def test_without_a_step_nothing_moves(loss):
     assert result.report.solve.final_cost == result.report.solve.initial_cost
     np.testing.assert_allclose(result.scene.lines.plucker, start.lines.plucker, atol=1e-12)
     np.testing.assert_array_equal(result.scene.points.xyz, start.points.xyz)
+
+
+def _blas_threads() -> int:
+    return max(library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas")
+
+
+@pytest.mark.kernels
+def test_linear_algebra_libraries_have_one_thread_all_the_time():
+    """Outside of the solves too: their threads would spin while they wait, on cores that other threads need."""
+    seen = []
+
+    def factors(draft):
+        seen.append(_blas_threads())
+        return iter(())
+
+    term = Term("asked while the problem is made", (), (), factors)
+    options = AdjustOptions(loss="none", max_iterations=2, terms=(term,))
+    with threadpool_limits(2, "blas"):
+        adjust(holistic(6, seed=0).start, options)
+    assert seen == [1]

@@ -9,13 +9,19 @@ import pytest
 import groma
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
-from groma.adjustment.survey.place import settled
+from groma.adjustment.survey.place import moved, settled
 from groma.adjustment.survey.reliability import reliability
+from groma.adjustment.terms.camera_poses import held_scale
+from groma.adjustment.uncertainty import uncertainty
 from groma.evaluation import evaluate_poses
+from groma.factors import SegmentOnPlane
 from groma.geometry import so3
+from groma.problem.gauge import world_motions
+from groma.scene import Similarity
 from groma.scene.measurements import PosePriors
 from groma.scene.survey import CameraPositions, Distances, Kind, KnownDirections, diagonal_covariance
 from groma.scene.synthetic import holistic
+from groma.solver.covariance.quantities import distance_between_cameras
 
 
 def _at_poses(sigma):
@@ -88,3 +94,56 @@ def test_a_scene_is_placed_at_its_poses_which_stay():
     for one in (away, away.replace(camera_positions=rough)):
         np.testing.assert_allclose(settled(one).cam_from_world, scene.cam_from_world, atol=1e-5)
         np.testing.assert_array_equal(settled(one).pose_priors.rig_from_world, scene.pose_priors.rig_from_world)
+
+
+@pytest.mark.kernels
+def test_a_scene_is_placed_where_its_rough_poses_fit_best():
+    """Pixels do not notice that it is turned and shifted as a whole, and rough poses weigh little beside them."""
+    truth, scene = _at_poses(5.0)
+    turned = scene.transformed(Similarity(1.0, so3.exp(np.array([[0.0, 0.02, 0.01]]))[0], np.array([0.3, 0.0, 0.1])))
+    turned = turned.replace(pose_priors=scene.pose_priors)
+    found = groma.adjust(turned, groma.AdjustOptions(loss="none", max_iterations=3)).scene
+    off = settled(found).cam_centers_in_world - found.cam_centers_in_world
+    assert np.abs(off).max() < 1e-5
+    np.testing.assert_allclose(found.cam_centers_in_world, truth.cam_centers_in_world, atol=0.02)
+    held = groma.adjust(turned, groma.AdjustOptions(loss="none", max_iterations=3, refine_poses=False)).scene
+    np.testing.assert_array_equal(held.frames.rig_from_world, turned.frames.rig_from_world)
+
+
+def test_segments_on_planes_do_not_tell_where_a_scene_is():
+    """Where it may move as a whole, the places on them move with it: a line askew would draw it along the line."""
+    made = holistic(8, 3, noise_px=0.5)
+    poses = made.start.frames.rig_from_world
+    priors = PosePriors(np.arange(len(poses)), poses, np.tile([5.0] * 3 + [1.0] * 3, (len(poses), 1)))
+    for scene, moves in ((made.start.replace(pose_priors=priors), True), (made.start, False)):
+        problem = assemble(scene, AssemblyOptions()).problem
+        (factor,) = (one for one in problem.factors if isinstance(one, SegmentOnPlane))
+        assert (factor.frame is not None) is moves
+        motions = {name: part.transpose(1, 2, 0) for name, part in world_motions(problem, np.zeros(3), 1.0).items()}
+        told = np.abs(moved(motions, factor, problem)[:, :, :6]).max()
+        assert told < 1e-10 if moves else told > 1e-3
+
+
+@pytest.mark.kernels
+@pytest.mark.parametrize("sigma", [0.5, 2.0])
+def test_a_held_scale_is_as_uncertain_as_measurements_leave_it(sigma):
+    """Positions with the deviation s at places x tell its logarithm to s / sqrt(sum |x - mean|^2), beside images that
+    are far more exact; and what they tell of shift and turn is untouched.
+    """
+    scene = _at_positions(sigma)
+    found = uncertainty(scene)
+    assert found.gauge == "measured" and held_scale(found.covariances.problem) is not None
+    centers = scene.cam_centers_in_world
+    away = centers - centers.mean(axis=0)
+    of_scale = sigma / np.sqrt(np.sum(away**2))
+    for second in (3, 5):
+        apart = distance_between_cameras(found.covariances, ("frames", 0), ("frames", second))
+        assert apart.sigma == pytest.approx(of_scale * apart.value, rel=0.02)
+    # Of each centre: a shift s / sqrt(n), turns by the inverse of their information, and the scale.
+    turns = sigma**2 * np.linalg.inv(np.sum(away**2) * np.eye(3) - away.T @ away)
+    hat = np.cross(away[:, None, :], np.eye(3)).swapaxes(1, 2)
+    expected = sigma**2 / len(away) * np.eye(3) + hat @ turns @ np.swapaxes(hat, 1, 2)
+    expected = expected + of_scale**2 * away[:, :, None] * away[:, None, :]
+    np.testing.assert_allclose(found.centers, expected, atol=0.02 * sigma**2)
+    places = found.covariances.of_coordinates("points")
+    assert np.isfinite(places).all() and np.linalg.eigvalsh(places).min() > 0.0

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from groma.errors import ShapeError
-from groma.factors.checks.check import ambients_of, linearized, residuals_of
+from groma.factors.checks.check import ambients_of, compare_jacobians, linearized, residuals_of
+from groma.factors.checks.world import WorldMotion, moved_world
 from groma.factors.contract import Ref, registered
 from groma.factors.relations.direction_pairs import (
     LineDirection,
@@ -22,6 +23,7 @@ from groma.factors.relations.direction_pairs import (
 from groma.factors.relations.line_on_plane import LineOnPlane, SegmentOnPlane
 from groma.factors.relations.point_on_line import PointOnLine
 from groma.factors.relations.point_on_plane import PointOnPlane
+from groma.geometry import so3
 
 pytestmark = pytest.mark.kernels
 N = 8
@@ -85,6 +87,19 @@ def test_line_on_plane_is_zero_for_lines_in_the_plane(rng):
         np.testing.assert_allclose(residuals_of(factor, ambients), 0.0, atol=1e-13)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_ends_in_cameras_move_with_the_world(seed):
+    example = SegmentOnPlane.in_cameras(np.random.default_rng(seed))
+    for block in compare_jacobians(example):
+        assert block.passed, block
+    slots, ambients = [slot for slot, _ in example.factor.references()], ambients_of(example)
+    motion = WorldMotion(
+        "turned and shifted", True, so3.exp(np.array([[0.9, -1.3, 1.1]]))[0], np.array([0.3, -0.4, 0.5])
+    )
+    before, after = (residuals_of(example.factor, now) for now in (ambients, moved_world(slots, ambients, motion)))
+    np.testing.assert_allclose(after, before, rtol=1e-9, atol=1e-12)
+
+
 def test_line_on_plane_measures_at_the_anchor(rng):
     p, d, n, x, off = rng.normal(size=(5, N, 3))
     ends = np.stack([p - 1.5 * d, p + 0.5 * d], axis=1) + np.cross(d, off)[:, None]  # beside the line
@@ -145,7 +160,7 @@ def test_scale_of_lines_and_planes_does_not_matter(cls, scale, rng):
     example = cls.example(rng)
     sizes = [example.variables[ref.group][0].factor_columns for _, ref in example.factor.references()]
     before, _ = linearized(example.factor, ambients_of(example), sizes)
-    kinds = [slot.kind for slot in cls.slots]
+    kinds = [slot.kind for slot, _ in example.factor.references()]
     scales = [scale if kind in ("line", "plane") else 1.0 for kind in kinds]
     scaled = tuple(a * s for a, s in zip(ambients_of(example), scales, strict=True))
     after, _ = linearized(example.factor, scaled, sizes)

@@ -7,7 +7,7 @@ import pytest
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.factors.losses import Cauchy
-from groma.problem import parallel
+from groma.problem import linearization, parallel
 from groma.problem.lay_out import lay_out
 from groma.problem.linearization import NormalEquations, to_solver_order
 from groma.problem.parallel import OrderedSums, Workers, shares_of
@@ -41,8 +41,9 @@ def test_every_share_has_a_third_of_each_kind_of_factor(layout):
     assert np.abs(parts.sum(axis=1) - totals.sum() / 3).max() <= 0.2 * totals.sum()
 
 
-def test_costs_are_those_of_all_factors_whatever_the_runs(layout):
+def test_costs_are_those_of_all_factors_whatever_the_runs(layout, monkeypatch):
     """The cost by runs of chunks is the sum over factors; of each landmark, the sum over its own; in any threads."""
+    monkeypatch.setattr(linearization, "COSTS_IN_THREADS", 0)
     states = to_solver_order(layout)
     found = []
     for threads in (1, 3):
@@ -70,6 +71,25 @@ def test_costs_are_those_of_all_factors_whatever_the_runs(layout):
     assert found[0][0] == pytest.approx(total, rel=1e-12)
     for one, other in zip(found[0][1:], wanted, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize(("costs", "records", "handed_over"), [(None, None, []), (0, None, [3]), (0, 0, [3, 3])])
+def test_little_work_wakes_no_other_thread(layout, monkeypatch, costs, records, handed_over):
+    """Some hundred factors are done sooner than another thread wakes; costs are compared with more than records."""
+    for name, least in (("COSTS_IN_THREADS", costs), ("LINEARISED_IN_THREADS", records)):
+        if least is not None:
+            monkeypatch.setattr(linearization, name, least)
+    calls, states = [], to_solver_order(layout)
+    monkeypatch.setattr(
+        parallel, "take_in_turn", lambda pool, helpers, work, tasks: calls.append(len(tasks)) or list(map(work, tasks))
+    )
+    workers = Workers(2)
+    equations = NormalEquations(layout, workers)
+    inputs = equations.prepare(states)
+    equations.cost(inputs)
+    equations.linearize(states, inputs)
+    workers.close()
+    assert calls == handed_over
 
 
 def test_chunks_that_are_not_wanted_are_left_out(layout):

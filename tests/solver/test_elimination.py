@@ -5,7 +5,7 @@ import pytest
 from problems import dense_normal_equations, scene_problem
 
 from groma.factors.losses import Cauchy
-from groma.problem import parallel
+from groma.problem import linearization, parallel
 from groma.problem.lay_out import lay_out
 from groma.problem.linearization import NormalEquations, to_solver_order
 from groma.problem.parallel import Workers
@@ -127,6 +127,7 @@ def test_whatever_is_eliminated_the_step_is_the_dense_one(eliminate):
 def test_threads_do_not_change_the_step(monkeypatch):
     """To the last digit: how the sums are divided depends on the problem alone."""
     monkeypatch.setattr(parallel, "FACTORS_FOR_THREADS", 0)
+    monkeypatch.setattr(linearization, "LINEARISED_IN_THREADS", 0)
     monkeypatch.setattr(parallel, "USES_OF_A_BLOCK", 1)
     problem = scene_problem(num_points=80, num_lines=40)
     _layout, equations, *_, one = eliminated_step(problem, 1e-2)

@@ -47,6 +47,7 @@ from groma.problem.residuals import Residuals
 from groma.scene import Scene
 from groma.scene.checks import check_scene_given
 from groma.scene.local_frame import local_frame
+from groma.solver.linear.blas import one_blas_thread
 from groma.solver.options import SolverOptions
 from groma.solver.report import SolveReport
 from groma.solver.solve import solve
@@ -164,20 +165,21 @@ def adjust(
     if options.camera_model is not None:
         scene, options = _in_model(scene, options, options.camera_model, progress)
     scene = near_the_middle_if_guessed(scene, options.refine_intrinsics, options.refine_principal_point)
-    near = local_frame(scene)
-    if near is None:
-        return _settled(scene, options, progress)
-    result = _settled(scene.transformed(near), options, progress)
+    with one_blas_thread():
+        if (near := local_frame(scene)) is None:
+            return _settled(scene, options, progress)
+        result = _settled(scene.transformed(near), options, progress)
     back = result.scene.transformed(near.inverse())
     return replace(result, scene=back, problem=result.problem and at_places_of(result.problem, back))
 
 
 def _settled(scene: Scene, options: AdjustOptions, progress: Callable[[Progress], bool | None] | None) -> AdjustResult:
-    """Adjust a scene that is first and last placed where measurements of other instruments fit best."""
-    if not (scene.has_survey and options.refine_poses):
+    """Adjust a scene that is first and last placed where measured places and poses known beforehand fit best."""
+    if not options.refine_poses:
         return _adjusted(scene, options, progress)
     result = _adjusted(settled(scene), options, progress)
-    after = settled(result.scene)
+    if (after := settled(result.scene)) is result.scene:
+        return result
     return replace(result, scene=after, problem=result.problem and at_places_of(result.problem, after, shifted=False))
 
 
@@ -192,8 +194,8 @@ def _in_model(
     refine = True if options.refine_intrinsics is None else options.refine_intrinsics
     options = replace(options, camera_model=None, refine_intrinsics=refine)
     if refine and options.points and options.lines and scene.num_line_observations and scene.num_point_observations:
-        settled = adjust(scene, replace(options, lines=False, planes=False), progress).scene
-        scene = scene.replace(cameras=settled.cameras)
+        of_points = replace(options, lines=False, planes=False)
+        scene = scene.replace(cameras=adjust(scene, of_points, progress).scene.cameras)
     return scene, options
 
 
@@ -269,10 +271,9 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
 
 
 def _log(outcome: AdjustReport) -> None:
-    cost = f"cost {outcome.solve.initial_cost:.5g} -> {outcome.solve.final_cost:.5g}"
-    steps = counted(outcome.solve.iterations, "steps")
     images, observations = counted(outcome.num_images, "images"), counted(outcome.num_observations, "observations")
-    logger_of("adjustment").info("%s, %s: %s, %s", images, observations, cost, steps)
+    cost, steps = (outcome.solve.initial_cost, outcome.solve.final_cost), counted(outcome.solve.iterations, "steps")
+    logger_of("adjustment").info("%s, %s: cost %.5g -> %.5g, %s", images, observations, *cost, steps)
     log_warnings("adjustment", outcome.warnings)
 
 

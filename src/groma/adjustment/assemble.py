@@ -266,12 +266,19 @@ def _landmark_variables(scene: Scene, options: AssemblyOptions) -> dict[str, Var
     variables = {}
     if options.points and (scene.num_point_observations or len(scene.point_depths)):
         variables["points"] = point_variables(scene, options.point_chart)
-    if len(scene.marks):
-        variables["control_points"] = Variables(Euclidean(3, "point"), scene.control_points.xyz)
+    variables |= control_point_variables(scene, options)
     if options.lines and scene.num_line_observations:
         chart = LINE_CHARTS[options.line_chart]
         variables["lines"] = Variables(chart, chart.from_ambient(scene.lines.plucker))
     return variables if options.refine_landmarks else _held(variables)
+
+
+def control_point_variables(scene: Scene, options: AssemblyOptions) -> dict[str, Variables]:
+    """Return the group of control points, if any was marked."""
+    if not len(scene.marks):
+        return {}
+    group = Variables(Euclidean(3, "point"), scene.control_points.xyz)
+    return {"control_points": group if options.refine_landmarks else replace(group, constant=True)}
 
 
 def structure_variables(scene: Scene, options: AssemblyOptions) -> dict[str, Variables]:

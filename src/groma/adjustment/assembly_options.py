@@ -50,6 +50,10 @@ class AssemblyOptions:
     refine_intrinsics: bool | None = False
     #: With the intrinsics: principal points too; None: of these cameras.
     refine_principal_point: bool | None = False
+    #: Of a scene that is one part of a whole, in all parts: which cameras see landmarks, and how many lengths relations
+    #: with planes compare with zero. None: as in the scene.
+    seen_cameras: tuple[int, ...] | None = None
+    num_lengths: int | None = None
     #: Estimate where cameras sit on their rig.
     refine_rigs: bool = False
     #: Estimate the common rotation of the right cameras of stereo pairs, with this prior. None:

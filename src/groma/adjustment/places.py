@@ -68,7 +68,7 @@ def _shifted(factor: Factor, shift: FloatArray) -> Factor:
         return replace(factor, cam_from_world=poses)
     if isinstance(factor, Distance) and factor.first_camera is None:
         return replace(factor, first_arm=factor.first_arm + shift)
-    if isinstance(factor, SegmentOnPlane | SegmentOnPlanePixels):
+    if isinstance(factor, SegmentOnPlanePixels) or (isinstance(factor, SegmentOnPlane) and factor.frame is None):
         return replace(factor, ends=factor.ends + shift)
     if isinstance(factor, OnKnownPlane):
         known = factor.known.copy()

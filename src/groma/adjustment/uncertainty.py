@@ -13,6 +13,7 @@ from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import assemble, first_camera_gauge
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.places import at_places_of
+from groma.adjustment.terms.camera_poses import held_scale
 from groma.adjustment.terms.objects import with_held
 from groma.adjustment.terms.principal_points import with_principal_points_known_to
 from groma.errors import InputError, ProblemError
@@ -22,6 +23,7 @@ from groma.scene import Scene
 from groma.scene.checks import check_scene_given
 from groma.scene.local_frame import local_frame
 from groma.solver.covariance.marginals import Covariances
+from groma.solver.covariance.released import released
 
 
 @dataclass(frozen=True)
@@ -246,10 +248,16 @@ def _covariances(
     problem = with_principal_points_known_to(problem, 1.0 / sigma0)
     if gauge == "measured":
         with suppress(ProblemError):
-            return gauge, Covariances(problem)
+            return gauge, measured_covariances(problem)
         gauge = "inner"
     datum = {"frames": [1, 1, 1, 0, 0, 0]} if gauge == "inner" and _free_cameras(problem) > 2 else None
     return gauge, Covariances(problem, gauge=gauge, datum=datum)
+
+
+def measured_covariances(problem: Problem) -> Covariances:
+    """Return covariances in the frame that measurements determine; a held scale is as uncertain as they leave it."""
+    covariances, held = Covariances(problem), held_scale(problem)
+    return covariances if held is None else released(covariances, held)
 
 
 def _summary(values: FloatArray) -> dict[str, Any]:

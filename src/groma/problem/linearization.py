@@ -23,7 +23,7 @@ from groma.problem._records import chain_rule, cost_scaled, cost_whitened, mask,
 from groma.problem._room import room_for_chunks, room_for_sums
 from groma.problem._sums import add_block, add_costs, add_cross, add_incidence, add_primary
 from groma.problem.layout import CHUNK_SIZE, Chunk, FactorLayout, Layout, in_runs
-from groma.problem.parallel import FACTORS_ALONE, Workers, shares_of, sum_of
+from groma.problem.parallel import COSTS_IN_THREADS, LINEARISED_IN_THREADS, Workers, shares_of, sum_of
 
 States = Mapping[str, FloatArray]
 
@@ -148,14 +148,14 @@ class NormalEquations:
                     add_costs(rho, begin, layout.landmark, landmark_costs[layout.eliminated])
             return sums, hidden
 
-        parts = self.workers.map(work, len(self.shares), self._is_little(wanted))
+        parts = self.workers.map(work, len(self.shares), self._is_little(wanted, COSTS_IN_THREADS))
         self.costs = [0.5 * sum(part[0][f] for part in parts) for f in range(len(self.layout.factors))]
         self.hidden = [sum(part[1][f] for part in parts) for f in range(len(self.layout.factors))]
         return float(sum(self.costs))
 
-    def _is_little(self, wanted: Callable[[Chunk], bool] | None) -> bool:
-        """Whether the selected chunks hold too few factors for another thread."""
-        return wanted is not None and sum(c.size for c in self.layout.chunks if wanted(c)) < FACTORS_ALONE
+    def _is_little(self, wanted: Callable[[Chunk], bool] | None, least: int) -> bool:
+        """Whether the selected chunks hold fewer factors than another thread is worth waking for."""
+        return sum(c.size for c in self.layout.chunks if wanted is None or wanted(c)) < least
 
     def _runs_of_all(self, share: int) -> list[tuple[int, int, int]]:
         if share not in self._all_runs:
@@ -255,7 +255,7 @@ class NormalEquations:
                     self._round(share, chunk)
             return costs, degenerate
 
-        parts = self.workers.map(work, len(self.shares), self._is_little(wanted))
+        parts = self.workers.map(work, len(self.shares), self._is_little(wanted, LINEARISED_IN_THREADS))
         self.costs = [0.5 * sum(part[0][f] for part in parts) for f in range(len(self.layout.factors))]
         self.num_degenerate = [sum(part[1][f] for part in parts) for f in range(len(self.layout.factors))]
         self.H = {pair: sum_of([H[pair] for H in self._H], self.workers) for pair in self.layout.num_direct}

@@ -51,9 +51,12 @@ class Workers:
 
 
 #: Problems with fewer factors are one share: they are not worth a thread; nor is a share of less than half of it. Where
-#: nothing is summed but costs, because nothing stays in a reduced system, fewer are, and so is what is left where the
-#: rest has converged (cost: time only).
+#: nothing is summed but costs, because nothing stays in a reduced system, fewer are (cost: time only).
 FACTORS_FOR_THREADS, FACTORS_ALONE = 50_000, 10_000
+#: Fewer factors are not worth waking another thread for: some 2 milliseconds of one thread, of which the other saves
+#: half, where waking it takes a tenth and it may have to wait for a core. A cost takes a third of a linearisation
+#: (cost: time only).
+LINEARISED_IN_THREADS, COSTS_IN_THREADS = 20_000, 60_000
 #: Most shares, and most bytes for every factor (about twice what its measurement takes) that copies of the reduced
 #: system would take if every share had one, as with many threads; two shares there are always (cost: memory).
 MAX_SHARES, MAX_BYTES = 16, 96

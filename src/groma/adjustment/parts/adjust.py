@@ -30,6 +30,7 @@ from groma.adjustment.parts.together import agreed
 from groma.adjustment.report import AdjustReport, not_converged
 from groma.errors import InputError, OutputError
 from groma.factors.losses import Loss, Trivial
+from groma.solver.linear.blas import one_blas_thread
 from groma.solver.options import SolverOptions
 from groma.solver.reduce.alone import Alone
 from groma.solver.reduce.contract import Reducer
@@ -115,8 +116,9 @@ def adjust_parts(
         if reducer.rank == 0:
             _prepare(Path(output), paths, begin is not None, force)
     run = Run(opened, losses, options, progress, reducer, room_for_parts(keep, reducer), checkpoint)
-    solved = run.solve(begin)
-    written = run.write(solved, Path(output))
+    with one_blas_thread():
+        solved = run.solve(begin)
+        written = run.write(solved, Path(output))
     with agreed(reducer):
         if reducer.rank == 0:
             _tidy(Path(output), paths, checkpoint)

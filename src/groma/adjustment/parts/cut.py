@@ -26,10 +26,10 @@ PART_SIZE = 1_000_000
 #: How parts in a folder are named.
 PART_NAMES = "part-*.npz"
 #: Tables that are the same in all parts.
-SHARED = ("cameras", "rigs", "sensors", "frames", "images", "planes", "directions")
+SHARED = ("cameras", "rigs", "sensors", "frames", "images", "planes", "directions", "principal_point_priors")
 #: Tables that are in the first part alone.
 ONCE = (
-    "keypoints", "plane_observations", "pose_priors", "principal_point_priors", "camera_positions", "camera_poses",
+    "keypoints", "plane_observations", "pose_priors", "camera_positions", "camera_poses",
     "control_points", "marks", "distances", "known_planes", "known_directions", "held",
 )  # fmt: skip
 

@@ -21,6 +21,7 @@ from groma.adjustment.assemble import (
     Assembly,
     assemble,
     camera_variables,
+    control_point_variables,
     first_camera_gauge,
     gauge_of,
     observations_of_frames,
@@ -31,7 +32,10 @@ from groma.adjustment.parts.same import check_same_scene
 from groma.adjustment.parts.together import agreed, exchange
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.adjustment.stages import with_loss
+from groma.adjustment.survey.place import moved_to, placement
+from groma.adjustment.terms.camera_poses import lengths_on_planes
 from groma.adjustment.terms.objects import with_held
+from groma.adjustment.terms.principal_points import is_prior, near_the_middle_if_guessed, observed_cameras
 from groma.errors import InputError
 from groma.factors.contract import Factor
 from groma.factors.losses import Loss
@@ -47,9 +51,27 @@ from groma.solver.reduce.shard import Shard
 from groma.solver.steps import States
 
 #: Groups of landmarks.
-LANDMARKS = ("points", "lines", "control_points")
-#: Groups that all parts share, by the first part of their names.
-SHARED = ("frames", "sensors", "intrinsics", "planes", "directions")
+LANDMARKS = ("points", "lines")
+#: Groups that all parts share, by the first part of their names. Control points are few, and distances tie them.
+SHARED = ("frames", "sensors", "intrinsics", "planes", "directions", "control_points")
+
+
+@dataclass(frozen=True)
+class Place:
+    """How parts are read: near the origin of their world, and where measurements of other instruments fit best."""
+
+    #: Moves a scene far from the origin of its world near to it.
+    near: Similarity | None
+    #: Moves it on to where it is placed; what was measured stays.
+    fits: Similarity | None
+    options: AssemblyOptions
+
+    def read(self, path: Path) -> Scene:
+        """Read a part."""
+        scene, how = read_archive(path), self.options
+        scene = near_the_middle_if_guessed(scene, how.refine_intrinsics, how.refine_principal_point)
+        scene = scene if self.near is None else scene.transformed(self.near)
+        return scene if self.fits is None else moved_to(scene, self.fits)
 
 
 @dataclass(frozen=True)
@@ -70,8 +92,8 @@ class OpenParts:
     parts: tuple[Part, ...]
     variables: dict[str, Variables]
     options: AssemblyOptions
-    #: Moves a scene far from the origin of its world near to it.
-    near: Similarity | None
+    #: Where the parts are read to.
+    place: Place
     #: Of every part: see :func:`_facts`.
     facts: tuple[dict[str, Any], ...]
     num_images: int = 0
@@ -83,15 +105,17 @@ class OpenParts:
 
     def read(self, part: Part) -> Scene:
         """Read a part, near the origin."""
-        return _read(part.path, self.near)
+        return self.place.read(part.path)
 
     def assembled(self, part: Part, states: States | None = None, loss: Loss | None = None) -> tuple[Scene, Assembly]:
         """Return a part as a scene, and as a problem at given states of all variables of this process."""
         scene = self.read(part)
-        made = assemble(scene, self.options)
+        made = _assembled(scene, self.options, part.path == self.paths[0])
         own = {} if states is None else self.states_of(part, states)
         # A part may have no factors of planes, for example; they move all the same.
         shared = {name: group for name, group in self.variables.items() if _is_shared(name)}
+        if not len(scene.control_points):
+            shared.pop("control_points", None)
         variables = {
             name: replace(group, state=own.get(name, group.state))
             for name, group in (shared | dict(made.problem.variables)).items()
@@ -150,41 +174,47 @@ def open_parts(paths: Sequence[Path], options: AssemblyOptions, reducer: Reducer
         sizes = [path.stat().st_size for path in paths]
     _check_same(reducer, [[path.name, size] for path, size in zip(paths, sizes, strict=True)])
     with agreed(reducer):
-        head = read_archive(paths[0])
+        place = Place(local_frame(read_archive(paths[0])), None, options)
+        head = place.read(paths[0])
         _check_distances(paths[0], head)
-        near = local_frame(head)
-        head = head if near is None else head.transformed(near)
+        if options.refine_poses:
+            place = replace(place, fits=placement(head))
+            head = head if place.fits is None else moved_to(head, place.fits)
     mine = np.flatnonzero(_owners(sizes, reducer.size) == reducer.rank)
     with agreed(reducer):
-        parts, own, facts, count = _read_own(paths, mine.tolist(), options, (head, near))
+        parts, own, facts, count = _read_own(paths, mine.tolist(), options, (head, place))
     told = {int(number): fact for part in exchange(reducer, facts) for number, fact in part.items()}
     ordered = tuple(told[number] for number in sorted(told))
     with agreed(reducer):
         if not any(fact["kept"] for fact in ordered):
             raise InputError("There is nothing to adjust: no part has points, lines or planes with observations.")
-    options = replace(options, gauge=_gauge(options, ordered))
-    held = first_camera_gauge(head, _sum_of(count, reducer), any(fact["metric"] for fact in ordered))
-    shared = with_held({**camera_variables(head, options, held), **structure_variables(head, options)}, head)
+    of_frames, of_cameras = np.split(_sum_of(count, reducer), [head.num_frames])
+    seen = tuple(np.flatnonzero(of_cameras).tolist())
+    lengths = sum(fact["lengths"] for fact in ordered)
+    options = replace(options, gauge=_gauge(options, ordered), seen_cameras=seen, num_lengths=lengths)
+    held = first_camera_gauge(head, of_frames, any(fact["metric"] for fact in ordered))
+    shared = {**camera_variables(head, options, held), **structure_variables(head, options)}
+    shared = with_held(shared | control_point_variables(head, options), head)
     used = {name for fact in ordered for name in fact["kept"]}
     with agreed(reducer):
         if unknown := sorted(used - shared.keys()):
             raise InputError(f"Parts cannot share these variables: {', '.join(unknown)}. Leave their options out.")
     variables = {name: group for name, group in shared.items() if name in used} | own
-    return OpenParts(tuple(paths), tuple(parts), variables, options, near, ordered, head.num_images)
+    return OpenParts(tuple(paths), tuple(parts), variables, options, place, ordered, head.num_images)
 
 
 def _read_own(
-    paths: Sequence[Path], mine: list[int], options: AssemblyOptions, first: tuple[Scene, Similarity | None]
+    paths: Sequence[Path], mine: list[int], options: AssemblyOptions, first: tuple[Scene, Place]
 ) -> tuple[list[Part], dict[str, Variables], dict[int, dict[str, Any]], IntArray]:
-    """Return the parts of this process, variables of theirs alone, facts by part, and observations of each frame."""
-    head, near = first
+    """Return the parts of this process, variables of theirs alone, facts by part, and what frames and cameras see."""
+    head, place = first
     groups: dict[str, list[Variables]] = {}
     held: dict[str, Variables] = {}
-    parts, facts, count = [], {}, np.zeros(head.num_frames, np.int64)
+    parts, facts, count = [], {}, np.zeros(head.num_frames + head.num_cameras, np.int64)
     for number in mine:
-        scene = _read(paths[number], near)
+        scene = place.read(paths[number])
         check_same_scene(paths[number], scene, paths[0], head, options.planes)
-        made = assemble(scene, options)
+        made = _assembled(scene, options, number == 0)
         rows = {}
         for name in LANDMARKS:
             if name in made.problem.variables:
@@ -195,17 +225,18 @@ def _read_own(
         parts.append(Part(paths[number], rows))
         held |= {name: made.problem.variables[name] for name in _held_besides(made)}
         facts[number] = _facts(accepted(scene), options, made)
-        count += observations_of_frames(scene)
+        count[: head.num_frames] += observations_of_frames(scene)
+        count[head.num_frames + observed_cameras(scene)] += 1
     return parts, held | {name: _joined(group) for name, group in groups.items()}, facts, count
 
 
 def _check_distances(path: Path, head: Scene) -> None:
-    """Refuse distances that tie two landmarks, all of which are eliminated in their part."""
-    table, landmarks = head.distances, (Kind.CONTROL_POINT, Kind.LINE)
-    tied = np.isin(table.first_kind, landmarks) & np.isin(table.second_kind, landmarks) & ~table.rejected
+    """Refuse distances that tie two lines, all of which are eliminated in their part."""
+    table = head.distances
+    tied = (table.first_kind == Kind.LINE) & (table.second_kind == Kind.LINE) & ~table.rejected
     if tied.any():
         raise InputError(
-            f"{path} has {counted(int(tied.sum()), 'distances')} between control points or lines, which are not "
+            f"{path} has {counted(int(tied.sum()), 'distances')} between lines, which are not "
             "adjusted in parts. Adjust the scene as a whole, or leave these distances out."
         )
 
@@ -215,9 +246,14 @@ def _sum_of(count: IntArray, reducer: Reducer) -> IntArray:
     return exact_sums.rounded(reducer.sum(count.astype(complex))).astype(np.int64)
 
 
-def _read(path: Path, near: Similarity | None) -> Scene:
-    scene = read_archive(path)
-    return scene if near is None else scene.transformed(near)
+def _assembled(scene: Scene, options: AssemblyOptions, is_first: bool) -> Assembly:
+    """Return a part as a problem; where principal points are expected counts once, in the first part."""
+    made = assemble(scene, options)
+    if is_first:
+        return made
+    kept = [(name, one) for name, one in zip(made.terms, made.groups, strict=True) if not is_prior(one.factor)]
+    problem = Problem(made.problem.variables, [one.factor for _, one in kept])
+    return replace(made, problem=problem, terms=tuple(n for n, _ in kept), groups=tuple(one for _, one in kept))
 
 
 def _facts(scene: Scene, options: AssemblyOptions, made: Assembly) -> dict[str, Any]:
@@ -231,6 +267,7 @@ def _facts(scene: Scene, options: AssemblyOptions, made: Assembly) -> dict[str, 
         "kept": sorted(made.problem.variables.keys() - set(LANDMARKS) - _held_besides(made)),
         "priors": len(scene.pose_priors) > 0 or scene.is_surveyed,
         "metric": scene.has_scale,
+        "lengths": lengths_on_planes(scene),
         "gauge": gauge_of(scene, options) if options.gauge == "auto" else options.gauge,
         "squares": {kind: [float(values.sum()), len(values)] for kind, values in squares.items()},
         "notes": [*made.notes, *_held_lenses(scene, options)],
@@ -240,7 +277,7 @@ def _facts(scene: Scene, options: AssemblyOptions, made: Assembly) -> dict[str, 
 def _held_lenses(scene: Scene, options: AssemblyOptions) -> list[str]:
     """Say that parts hold what a whole scene estimates of a calibration that was not given."""
     count = len(scene.principal_point_priors)
-    if not count or options.refine_principal_point:
+    if not count or (options.refine_principal_point is not False and options.refine_intrinsics is not False):
         return []
     rest = "" if options.refine_intrinsics else " and the rest, which --refine-intrinsics (refine_intrinsics) estimates"
     return [f"The calibration of {counted(count, 'cameras')} was not given. Parts hold the principal points{rest}."]

@@ -19,10 +19,12 @@ from groma.adjustment.relation_outcome import drop_failed_relations
 from groma.adjustment.rescue.restart import renew_lines, with_seen_ends
 from groma.adjustment.rescue.slips import without_slips
 from groma.adjustment.stages import STAGES, one_after_another, stage_entries
+from groma.adjustment.survey.place import moved_to, placement
 from groma.adjustment.terms.objects import with_held_states
 from groma.factors.losses import GemanMcClure, Loss, Trivial
 from groma.gates import chi_square_gate
 from groma.io.archive import write_archive
+from groma.scene import Similarity
 from groma.solver.options import SolverOptions
 from groma.solver.reduce.contract import Reducer
 from groma.solver.reduce.shards import solve_shards
@@ -174,9 +176,22 @@ class Run:
         median = 2.0 ** (BIN_RANGE[0] + (middle + 0.5) * (BIN_RANGE[1] - BIN_RANGE[0]) / BINS)
         return max(loss.scale, STAGES.last_scale * float(np.sqrt(median / chi_square_gate(0.5, 2))))
 
+    def _place_of(self, solved: Solved) -> Similarity | None:
+        """Return where measurements of other instruments fit best now, found by the process that has their part."""
+        found, first = None, self.opened.paths[0]
+        with agreed(self.reducer):
+            for part in self.opened.parts if self.opened.place.fits is not None else ():
+                if part.path == first:
+                    scene, made = self.opened.assembled(part, solved.states, solved.loss)
+                    last = placement(disassemble(scene, made.problem))
+                    assert last is not None
+                    found = last.scale, last.rotation.tolist(), last.translation.tolist()
+        told = next((one for one in exchange(self.reducer, found) if one), None)
+        return told and Similarity(told[0], np.array(told[1]), np.array(told[2]))
+
     def write(self, solved: Solved, output: Path) -> Written:
         """Write the parts of this process; return squared residuals and relations of all parts."""
-        own, opened = {}, self.opened
+        own, opened, fits = {}, self.opened, self._place_of(solved)
         with agreed(self.reducer):
             for part in opened.parts:
                 scene, made = opened.assembled(part, solved.states, solved.loss)
@@ -184,8 +199,10 @@ class Run:
                 if "lines" in part.rows and self.checkpoint.moved[part.rows["lines"]].any():
                     moved = np.flatnonzero(self.checkpoint.moved[part.rows["lines"]])
                     adjusted = with_seen_ends(adjusted, moved)
-                if opened.near is not None:
-                    adjusted = adjusted.transformed(opened.near.inverse())
+                if fits is not None:
+                    adjusted = moved_to(adjusted, fits)
+                if opened.place.near is not None:
+                    adjusted = adjusted.transformed(opened.place.near.inverse())
                 write_archive(adjusted, output / part.path.name, force=True)
                 squares = squared_residuals_px(made)
                 squares = {kind: [float(v.sum()), len(v)] for kind, v in squares.items()}

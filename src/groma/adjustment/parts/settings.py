@@ -37,6 +37,4 @@ def settings_of(
         threads=options.threads,
     )
     values = {item.name: getattr(assembly, item.name) for item in fields(assembly) if item.name != "loss"}
-    # What is expected of principal points is in the first part alone.
-    values |= {name: bool(values[name]) for name in ("refine_intrinsics", "refine_principal_point")}
     return losses, solver, values

@@ -58,12 +58,19 @@ def settled(scene: Scene) -> Scene:
 
     The scale is kept, too, if depths or stereo pairs determine it; scenes with held objects are left unchanged.
     """
+    similarity = placement(scene)
+    return scene if similarity is None else moved_to(scene, similarity)
+
+
+def placement(scene: Scene) -> Similarity | None:
+    """Return the motion that :func:`settled` moves a scene by; None where it stays."""
     if not (scene.has_survey or len(scene.pose_priors)) or len(scene.held) or not scene.num_images:
-        return scene
-    return _moved(scene, _best(scene))
+        return None
+    return _best(scene)
 
 
-def _moved(scene: Scene, similarity: Similarity) -> Scene:
+def moved_to(scene: Scene, similarity: Similarity) -> Scene:
+    """Return a scene moved by a similarity; what was measured of it stays."""
     return scene.transformed(similarity, measured=False).replace(pose_priors=scene.pose_priors)
 
 
@@ -82,7 +89,7 @@ def _best(scene: Scene) -> Similarity:
         step = np.zeros(7)
         step[:free] = -np.linalg.pinv(scaled, rcond=_UNKNOWN, hermitian=True) @ (gradient[:free] / size) / size
         next_ = _similarity(step, total.points(middle), length * total.scale)
-        light, total = _moved(light, next_), next_.after(total)
+        light, total = moved_to(light, next_), next_.after(total)
         if np.abs(step[:free] * size).max() <= _TOLERANCE:  # in standard deviations
             break
     return total

@@ -50,6 +50,7 @@ from groma.adjustment.survey.records import (
 from groma.adjustment.terms import camera_poses, control_points, distances, known_geometry
 from groma.adjustment.terms.contract import Draft
 from groma.adjustment.terms.objects import name_of, rows_by_kind
+from groma.adjustment.uncertainty import measured_covariances
 from groma.errors import ProblemError
 from groma.factors.contract import Factor
 from groma.factors.losses import Trivial
@@ -145,7 +146,7 @@ def _frame(problem: Problem, factors: list[Factor]) -> _Frame:
     then also so much less exact than the scene in itself that its part of their covariance can be taken one by one.
     """
     try:
-        return _Frame(Covariances(problem))
+        return _Frame(measured_covariances(problem))
     except ProblemError:
         covariances = Covariances(problem, gauge="inner")
     free = covariances.motions

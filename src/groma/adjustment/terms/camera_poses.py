@@ -26,12 +26,14 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.adjustment.terms.contract import Draft, Group, Term
 from groma.adjustment.terms.survey_loss import root_information, survey_loss
-from groma.factors.contract import Ref
+from groma.factors.contract import Factor, Ref
+from groma.factors.losses import Trivial
 from groma.factors.priors.distance import Distance
 from groma.factors.priors.pose_prior import PosePrior
 from groma.factors.priors.position_prior import PositionPrior
 from groma.gates import gate
 from groma.geometry import se3
+from groma.problem.problem import Problem
 from groma.scene import Scene
 
 
@@ -89,7 +91,7 @@ def _held_scale(draft: Draft) -> Iterator[Group]:
     if scene.is_metric or not (told and options.planes and options.refine_poses and options.structure_form == "metric"):
         return
     information = _information_on_scale(scene)
-    num_lengths = len(scene.relations.point_on_plane) + 2 * len(scene.relations.line_on_plane)
+    num_lengths = lengths_on_planes(scene) if options.num_lengths is None else options.num_lengths
     centers = se3.inverse(scene.frames.rig_from_world)[:, 4:]
     apart = np.linalg.norm(centers - centers[0], axis=1)
     if num_lengths <= GATES.max_shrinkage * information or apart.max() == 0.0:
@@ -97,8 +99,7 @@ def _held_scale(draft: Draft) -> Iterator[Group]:
     if scene.has_scale and information > 0.0:
         draft.notes.append(
             f"Measurements determine the scale to {100.0 * information**-0.5:.2g} % (standard deviation). Relations "
-            "with planes would shrink the scene against them: the scale was held in the adjustment, and standard "
-            "deviations of places are without that of the scale."
+            "with planes would shrink the scene against them: the scale was held in the adjustment."
         )
     far = apart.argmax(keepdims=True)
     yield Group(
@@ -111,6 +112,17 @@ def _held_scale(draft: Draft) -> Iterator[Group]:
             sqrt_information=(num_lengths / GATES.max_shrinkage) ** 0.5 / apart[far],
         )
     )
+
+
+def lengths_on_planes(scene: Scene) -> int:
+    """Return how many lengths relations with planes compare with zero."""
+    return len(scene.relations.point_on_plane) + 2 * len(scene.relations.line_on_plane)
+
+
+def held_scale(problem: Problem) -> Factor | None:
+    """Return the factor that holds the scale of a problem; measured distances have a robust loss."""
+    held = (one for one in problem.factors if isinstance(one, Distance) and isinstance(one.loss, Trivial))
+    return next(held, None)
 
 
 def _information_on_scale(scene: Scene) -> float:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from groma._typing import BoolArray
+from groma._typing import BoolArray, IntArray
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.terms.contract import Draft, Group, Term
 from groma.cameras import model as camera_model
@@ -66,12 +66,17 @@ def near_the_middle_if_guessed(scene: Scene, refine_intrinsics: bool | None, ref
     return scene.replace(principal_point_priors=table.take(exactly))
 
 
+def observed_cameras(scene: Scene) -> IntArray:
+    """Return the cameras that see points or lines."""
+    seen = [table.image_idx for table in (scene.point_observations, scene.line_observations)]
+    return np.unique(scene.images.camera_idx[np.concatenate(seen)])
+
+
 def estimated_by_prior(scene: Scene, options: AssemblyOptions) -> BoolArray:
     """Return of which cameras (C,) the principal point is estimated with what is known of it: of those that see."""
     found = np.zeros(scene.num_cameras, bool)
     if options.refine_intrinsics is not False and options.refine_principal_point is not False:
-        seen = [table.image_idx for table in (scene.point_observations, scene.line_observations)]
-        found[scene.images.camera_idx[np.concatenate(seen)]] = True
+        found[observed_cameras(scene) if options.seen_cameras is None else np.array(options.seen_cameras, int)] = True
         found &= np.isin(np.arange(len(found)), scene.principal_point_priors.camera_idx)
     return found
 

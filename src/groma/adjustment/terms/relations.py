@@ -28,6 +28,7 @@ from groma.factors.relations.line_on_plane import SegmentOnPlane
 from groma.factors.relations.lines_meeting import LinesMeeting
 from groma.factors.relations.point_on_line import PointOnLine
 from groma.factors.relations.point_on_plane import PointOnPlane
+from groma.geometry import quaternion
 from groma.scene import Relations, Scene
 
 #: Angles between planes and directions, and the types of their factors.
@@ -132,11 +133,24 @@ def _factors(draft: Draft) -> Iterator[Group]:
             continue
         pairs = getattr(draft.scene.relations, kind)[rows]
         columns: dict[str, Any] = {
-            slot.name: Ref(group, index) for slot, group, index in zip(factor.slots, groups, pairs.T, strict=True)
+            slot.name: Ref(group, index) for slot, group, index in zip(factor.slots[:2], groups, pairs.T, strict=True)
         }
         if kind == "line_on_plane":
-            columns["ends"] = draft.scene.lines.segments[pairs[:, 0]]
+            columns |= _ends(draft, pairs[:, 0])
         yield Group(factor(**columns, sqrt_information=_weights(draft, kind, rows), loss=draft.relation_loss))
+
+
+def _ends(draft: Draft, lines: IntArray) -> dict[str, Any]:
+    """Return the ends of segments: where the whole scene may move, in the frame of a camera that moves with it."""
+    scene, ends, options = draft.scene, draft.scene.lines.segments[lines], draft.options
+    moves = options.refine_poses and options.held_frames is None
+    if not (moves and (options.gauge == "free" or scene.is_tied)):
+        return {"ends": ends}
+    table, frame = scene.line_observations, np.zeros(scene.num_lines, np.int64)
+    frame[table.line_idx] = scene.images.frame_idx[table.image_idx]  # any that sees the line
+    poses = scene.frames.rig_from_world[frame[lines]]
+    turned = quaternion.rotate(np.repeat(poses[:, :4], 2, axis=0), ends.reshape(-1, 3)).reshape(ends.shape)
+    return {"frame": Ref("frames", frame[lines]), "ends": turned + poses[:, None, 4:]}
 
 
 def _groups(kind: str) -> tuple[str, str]:

@@ -19,6 +19,12 @@ The anchor matters. Without one, h is taken at the foot point of the world origi
 that was seen: a tiny angle then moves it by a lot, and moving the world changes the adjustment. Give the middle of the
 segment, or use the second form with its ends. Anchors are constants, so they need not lie on the line.
 
+Constants of the world do not move with it: a line that is a little askew then lies better on its plane if the whole
+world slides along it. Where poses and landmarks may move together, give the ends e in the frame of a camera (R, t),
+
+.. math:: a = R^\top (e - t), \qquad \frac{\partial h}{\partial (\rho, \omega)} = \left[-(Rg)^\top,\;
+          -(e \times Rg)^\top\right], \qquad g = \frac{(\hat n \cdot d)\, d}{\lVert d\rVert^2}.
+
 .. math:: \frac{\partial \hat d\cdot\hat n}{\partial d} = \frac{(\hat n - r_1 \hat d)^\top}{\lVert d\rVert}, \quad
           \frac{\partial \hat d\cdot\hat n}{\partial n} = \frac{(\hat d - r_1 \hat n)^\top}{\lVert n\rVert}
 
@@ -38,7 +44,7 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import Columns, FloatArray, Inputs
-from groma.factors._examples import indices, make_example
+from groma.factors._examples import indices, make_example, random_poses
 from groma.factors._record import put_block, put_residual, set_rows
 from groma.factors.contract import WORLD_FIXED, Example, Factor, Invariance, Ref, Slot, register
 
@@ -83,6 +89,55 @@ def _distance_row(row, line, plane, a, r, J_line, J_plane):
     J_plane[row, 1] = (c1 - h * n1) * kn
     J_plane[row, 2] = (c2 - h * n2) * kn
     J_plane[row, 3] = kn
+
+
+@kernel
+def _place_in_world(pose, e, a):
+    """Write the place in the world ``a`` of one in the camera ``e``."""
+    x, y, z = e[0] - pose[3], e[1] - pose[7], e[2] - pose[11]
+    for j in range(3):
+        a[j] = pose[j] * x + pose[4 + j] * y + pose[8 + j] * z
+
+
+@kernel
+def _put_pose(row, line, plane, pose, e, out, c):
+    """Write row ``row`` of the block of the pose that carries the anchor."""
+    d0, d1, d2 = line[3], line[4], line[5]
+    nn = plane[0] * plane[0] + plane[1] * plane[1] + plane[2] * plane[2]
+    k = (plane[0] * d0 + plane[1] * d1 + plane[2] * d2) / (math.sqrt(nn) * (d0 * d0 + d1 * d1 + d2 * d2))
+    h0 = k * (pose[0] * d0 + pose[1] * d1 + pose[2] * d2)
+    h1 = k * (pose[4] * d0 + pose[5] * d1 + pose[6] * d2)
+    h2 = k * (pose[8] * d0 + pose[9] * d1 + pose[10] * d2)
+    out[row, c], out[row, c + 1], out[row, c + 2] = -h0, -h1, -h2
+    out[row, c + 3], out[row, c + 4] = h1 * e[2] - h2 * e[1], h2 * e[0] - h0 * e[2]
+    out[row, c + 5] = h0 * e[1] - h1 * e[0]
+
+
+@loop
+def _linearize_in_cameras(ends, rows, indices, begin, end, columns, record):
+    lines, planes, poses = rows
+    a, r, J_line, J_plane = np.empty(3), np.empty(2), np.empty((2, 6)), np.empty((2, 4))
+    degenerate, c = 0, columns[2]
+    for i in range(begin, end):
+        line, plane, pose = lines[indices[0][i]], planes[indices[1][i]], poses[indices[2][i]]
+        out = record[i - begin]
+        dd = line[3] * line[3] + line[4] * line[4] + line[5] * line[5]
+        nn = plane[0] * plane[0] + plane[1] * plane[1] + plane[2] * plane[2]
+        if dd > 1e-200 and nn > 1e-200:
+            for k in range(2):
+                _place_in_world(pose, ends[i, k], a)
+                _distance_row(k, line, plane, a, r, J_line, J_plane)
+                if c >= 0:
+                    _put_pose(k, line, plane, pose, ends[i, k], out, c)
+        else:
+            r[:], J_line[:], J_plane[:] = 0.0, 0.0, 0.0
+            degenerate += 1
+            if c >= 0:
+                out[:, c : c + 6] = 0.0
+        put_block(J_line, out, columns[0])
+        put_block(J_plane, out, columns[1])
+        put_residual(r, out)
+    return degenerate
 
 
 @loop
@@ -173,16 +228,30 @@ class SegmentOnPlane(_LineAndPlane):
     Degenerate for a line or plane at infinity.
     """
 
-    #: (N, 2, 3) world points near the two ends of each segment.
+    #: The cameras in whose frames the ends are; None: they are in the world.
+    frame: Ref | None = None
+    #: (N, 2, 3) places near the two ends of each segment.
     ends: FloatArray
+
+    slots: ClassVar[tuple[Slot, ...]] = (*_LineAndPlane.slots, Slot("frame", "pose", optional=True))
 
     def __post_init__(self) -> None:
         set_rows(self, "ends", 2, 3)
 
     def linearize(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
-        return self._evaluate(False, self.ends, inputs, begin, end, columns, record)
+        if self.frame is None:
+            return self._evaluate(False, self.ends, inputs, begin, end, columns, record)
+        indices = self.line.index, self.plane.index, self.frame.index
+        return _linearize_in_cameras(self.ends, inputs, indices, begin, end, columns, record)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102
         line, plane = Ref("lines", indices(rng, 5)), Ref("planes", indices(rng, 3))
         return make_example(cls(line=line, plane=plane, ends=rng.normal(size=(6, 2, 3))), rng)
+
+    @classmethod
+    def in_cameras(cls, rng: np.random.Generator) -> Example:
+        """Return an example whose ends are in the frames of cameras."""
+        line, plane, frame = (Ref(name, indices(rng, 3)) for name in ("lines", "planes", "poses"))
+        factor = cls(line=line, plane=plane, frame=frame, ends=rng.normal(size=(6, 2, 3)))
+        return make_example(factor, rng, states={"poses": random_poses(rng, 3, rotation=0.7)})

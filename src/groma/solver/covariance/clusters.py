@@ -48,13 +48,20 @@ def clustered(covariances: Covariances, variable: Variable, landmarks: str, clus
     return sums.T @ sums * (count / max(count - size, 1))
 
 
-def with_kept(covariances: Covariances, group: str, index: int) -> dict[str, FloatArray]:
-    """Return the covariances (count, dof, own dof) of the kept variables of all groups with one of them."""
+def rows_of_kept(covariances: Covariances) -> dict[str, IntArray]:
+    """Return which unknowns (count, dof) of the reduced system the kept variables are, by group."""
     layout, rows = covariances._layout, {}
     groups = layout.problem.variables
     for name, (c, member) in covariances._kept.items():
         kept, block = layout.kept[c], member.blocks(np.arange(len(groups[name])))[:, None]
         rows[name] = kept.start + block * kept.width + member.offset + np.arange(groups[name].manifold.dof)
+    return rows
+
+
+def with_kept(covariances: Covariances, group: str, index: int) -> dict[str, FloatArray]:
+    """Return the covariances (count, dof, own dof) of the kept variables of all groups with one of them."""
+    layout, rows = covariances._layout, rows_of_kept(covariances)
+    groups = layout.problem.variables
     own = groups[group].manifold.dof
     R = np.zeros((layout.num_kept_unknowns, own))
     R[rows[group][index], np.arange(own)] = 1.0

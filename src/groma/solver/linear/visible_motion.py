@@ -90,7 +90,7 @@ def observers(problem: Problem, name: str, centers: dict[str, FloatArray]) -> Ob
     all_centers = np.ascontiguousarray(np.concatenate(every))
     none = np.zeros(0, np.int64)
     variables, poses = [none], [none]
-    for factor in problem.factors:
+    for factor in (one for one in problem.factors if not one.is_incidence):
         mine = [ref for _, ref in factor.references() if ref.group == name]
         from_pose = [ref for slot, ref in factor.references() if ref.group in offsets and slot.name != "extrinsics"]
         if len(mine) == 1 and len(from_pose) == 1 and from_pose[0].group != name:
