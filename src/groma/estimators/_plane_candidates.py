@@ -176,6 +176,18 @@ def from_neighbours(
     return planes[valid], seed[valid]
 
 
+def from_parallels(
+    features: Features, planes: FloatArray, labels: IntArray, rng: np.random.Generator
+) -> tuple[FloatArray, IntArray]:
+    """Candidates (H, 4) through free features, parallel to planes (K, 4) that neighbours are on; their homes (H,)."""
+    free = np.flatnonzero(labels < 0)
+    seed = np.sort(rng.permutation(free)[: max(len(free) // PLANE_SEARCH.features_per_seed, PLANE_SEARCH.min_seeds)])
+    label = np.sort(labels[features.neighbours[seed]], axis=1)
+    once = (label >= 0) & (np.diff(label, axis=1, prepend=-1) > 0)
+    homes, normal = np.repeat(seed, once.sum(axis=1)), planes[label[once], :3]
+    return np.column_stack([normal, -dot(normal, features.places[homes])]), homes
+
+
 def from_segments(features: Features, corner: IntArray, gate: float) -> tuple[FloatArray, IntArray, int]:
     """Candidates (H, 4) from near segments that are coplanar within their noise, their homes, and how many were tried.
 

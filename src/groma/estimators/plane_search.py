@@ -34,7 +34,14 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
-from groma.estimators._plane_candidates import Features, Scores, features_of, from_neighbours, from_segments
+from groma.estimators._plane_candidates import (
+    Features,
+    Scores,
+    features_of,
+    from_neighbours,
+    from_parallels,
+    from_segments,
+)
 from groma.estimators._plane_growth import Grower, Grown, connected_to
 from groma.estimators._plane_options import PLANE_SEARCH, PlaneOptions
 from groma.gates import chi_square_gate
@@ -165,32 +172,42 @@ def _extract(
     """Find planes, then rough ones; ``filled`` gets their numbers."""
     features, labels = features_of(places, noise, partner, carrier), np.full(len(places), -1)
     found: list[Grown] = []
+    gate = chi_square_gate(1.0 - options.level, 1)
     for one in (features, features.thicker(PLANE_SEARCH.thicker)):
-        if np.count_nonzero(labels < 0) >= options.min_support:
-            _extract_of(one, num_points, labels, found, options, progress)
+        if np.count_nonzero(labels < 0) < options.min_support:
+            break
+        rng, number = np.random.default_rng(options.seed), -1
+        free, corner = one.position[labels[one.position] < 0], one.position[num_points:].reshape(-1, 2)
+        first, first_homes = from_neighbours(one, free, gate, rng)
+        second, second_homes, num_pairs = from_segments(one, corner[(labels[corner] < 0).all(axis=1)], gate)
+        candidates, homes = np.concatenate([first, second]), np.concatenate([first_homes, second_homes])
+        num_tried = len(first) + num_pairs
+        while number < len(found):
+            number = len(found)
+            _extract_of(one, candidates, homes, num_tried, labels, found, options, progress)
+            candidates, homes = from_parallels(
+                one, np.array([grown.fit.plane for grown in found]).reshape(-1, 4), labels, rng
+            )
+            num_tried += len(candidates)
     filled[features.given] = labels
     return found
 
 
 def _extract_of(
     features: Features,
-    num_points: int,
+    candidates: FloatArray,
+    homes: IntArray,
+    num_tried: int,
     labels: IntArray,
     found: list[Grown],
     options: PlaneOptions,
     progress: Callable[[int, int], None],
 ) -> None:
     """Find planes one by one, beside those ``found``; ``labels`` and ``found`` are added to."""
-    rng = np.random.default_rng(options.seed)
     gate = chi_square_gate(1.0 - options.level, 1)
-    free = features.position[labels[features.position] < 0]
-    corner = features.position[num_points:].reshape(-1, 2)
-    first, first_homes = from_neighbours(features, free, gate, rng)
-    second, second_homes, num_pairs = from_segments(features, corner[(labels[corner] < 0).all(axis=1)], gate)
-    candidates, homes = np.concatenate([first, second]), np.concatenate([first_homes, second_homes])
     scores = Scores(features, candidates, homes, gate, PLANE_SEARCH.link)
     support, score = scores.of(np.arange(len(candidates)), labels)
-    log_tried = np.log10(2.0 * PLANE_SEARCH.refined * (len(first) + num_pairs) + 1.0)  # two thicknesses
+    log_tried = np.log10(2.0 * PLANE_SEARCH.refined * num_tried + 1.0)  # two thicknesses
     # With less information than the test of false alarms needs, a candidate will be rejected.
     least_score = np.log(10.0) * (log_tried - np.log10(options.max_false_alarms))
     alive = (support >= 0.5 * options.min_support) & (score >= least_score)
