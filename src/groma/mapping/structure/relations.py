@@ -230,7 +230,7 @@ def _in_layer(
     lines, ends = usable_lines[near], ends[near]
     spacing = np.concatenate([marks.point_spacing[rows], marks.end_spacing[lines].ravel()])
     near = connected_to(places, np.concatenate([at, ends.reshape(-1, 3)]), spacing, plane)
-    lines, rows = lines[near[len(rows) :].reshape(-1, 2).all(axis=1)], rows[near[: len(rows)]]
+    lines, rows = lines[near[len(rows) :].reshape(-1, 2).any(axis=1)], rows[near[: len(rows)]]
     height, variance = _point_heights(marks, rows, plane, covariance)
     unused = np.zeros(len(rows))
     points = np.column_stack([rows.astype(np.float64), height, np.sqrt(variance), height, unused, variance, unused])
