@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Candidates of :mod:`groma.estimators.plane_search`: planes of neighbouring features, and of near segments.
+"""Candidates of :mod:`groma.estimators.plane_search`: planes of neighbouring features, of near segments, and of planes.
 
 Their number grows with the features, and each looks only at what is near: a scene has the same candidates whether it
 stands alone or is part of a larger one.
@@ -176,7 +176,7 @@ def from_neighbours(
     return planes[valid], seed[valid]
 
 
-def from_parallels(
+def from_planes(
     features: Features, planes: FloatArray, labels: IntArray, rng: np.random.Generator
 ) -> tuple[FloatArray, IntArray]:
     """Candidates (H, 4) through free features, parallel to planes (K, 4) that neighbours are on, or at right angles to

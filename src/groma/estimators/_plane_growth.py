@@ -256,7 +256,7 @@ class Grower:
         return log10_binomial_tail(inside - 4, number - 3, chance / max(number, 1)) + self._log_tried  # three fix it
 
     def _edges(self, on: IntArray, labels: IntArray) -> IntArray:
-        """Of what lies on a plane, both ends of segments that were taken out with others: edges of a face are on two."""
+        """Of what lies on a plane, both ends of segments that were taken out with others: an edge is on two faces."""
         other = self._features.partner[on]
         return on[(labels[on] >= 0) & (other != on) & np.isin(other, on)]
 

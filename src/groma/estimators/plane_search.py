@@ -12,6 +12,11 @@ points have their neighbours there anyway. It is kept if
   filled as the fuller side of the layer is. Relief without a flat part has no plane, nor has a thin post one that cuts
   through its sides, nor a round body one that touches it.
 
+Narrow faces, such as treads, have few neighbours on themselves, so that few of the planes drawn are theirs. They are
+parallel to faces beside them, or at right angles to two: such planes through what is left are drawn next, as long as
+any are found. And the edges of a face are on two: what was taken out with another plane counts in the test against
+chance, if it is a segment, both ends of which are on this one, too.
+
 What is left is searched again as rough walls, by features with four times the noise. As neighbours deviate alike on
 these, their number does not make the normal better known: the noise is at most ``max_tilt`` of the spread of the plane
 across its longest axis. Among so many thicker layers some stand out against their sides by chance, so that this test
@@ -39,7 +44,7 @@ from groma.estimators._plane_candidates import (
     Scores,
     features_of,
     from_neighbours,
-    from_parallels,
+    from_planes,
     from_segments,
 )
 from groma.estimators._plane_growth import Grower, Grown, connected_to
@@ -172,10 +177,14 @@ def _extract(
     """Find planes, then rough ones; ``filled`` gets their numbers."""
     features, labels = features_of(places, noise, partner, carrier), np.full(len(places), -1)
     found: list[Grown] = []
-    gate = chi_square_gate(1.0 - options.level, 1)
+    gate, settled = chi_square_gate(1.0 - options.level, 1), 0
+
+    def say(done: int, total: int) -> None:
+        progress(settled + done, settled + total)
+
     for one in (features, features.thicker(PLANE_SEARCH.thicker)):
         if np.count_nonzero(labels < 0) < options.min_support:
-            break
+            break  # too few are left
         rng, number = np.random.default_rng(options.seed), -1
         free, corner = one.position[labels[one.position] < 0], one.position[num_points:].reshape(-1, 2)
         first, first_homes = from_neighbours(one, free, gate, rng)
@@ -184,10 +193,10 @@ def _extract(
         num_tried = len(first) + num_pairs
         while number < len(found):
             number = len(found)
-            _extract_of(one, candidates, homes, num_tried, labels, found, options, progress)
-            candidates, homes = from_parallels(
-                one, np.array([grown.fit.plane for grown in found]).reshape(-1, 4), labels, rng
-            )
+            _extract_of(one, candidates, homes, num_tried, labels, found, options, say)
+            settled += len(candidates)
+            planes = np.array([grown.fit.plane for grown in found]).reshape(-1, 4)
+            candidates, homes = from_planes(one, planes, labels, rng)
             num_tried += len(candidates)
     filled[features.given] = labels
     return found
