@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from groma.errors import InputError, ShapeError
+from groma.estimators._plane_candidates import features_of, from_planes
 from groma.estimators.association import inlier_probability
 from groma.estimators.plane_fit import fit_plane, tilt_sigma
 from groma.estimators.plane_search import PlaneOptions, find_planes
@@ -126,6 +127,49 @@ def test_no_rough_plane_through_steps():
     points = np.concatenate([wall(rng, 150, 2, 0.15 * k, 1.0, (0.0, 1.0 * k)) for k in range(6)])
     found = find_planes(points, noise_of(points))
     assert len(found) == 6 and (np.abs(found.planes[:, 2]) > np.cos(0.05)).all()
+
+
+def stairs(seed, num=8, points=15):
+    """Points on treads and risers, few on each, and the edges between them; and their covariance."""
+    rng, faces, edges = np.random.default_rng(seed), [], []
+    for k in range(num):
+        for start, along in (([0.0, 0.28 * k, 0.17 * k], [0.28, 0.0]), ([0.0, 0.28 * k, 0.17 * (k - 1)], [0.0, 0.17])):
+            faces.append(start + np.column_stack([rng.uniform(0, 2, points), rng.uniform(0, 1, (points, 1)) * along]))
+        edges.append([[0.0, 0.28 * k, 0.17 * k], [2.0, 0.28 * k, 0.17 * k]])
+    found = np.concatenate(faces), np.array(edges)
+    return *(each + rng.normal(0, 0.1 * SIGMA, each.shape) for each in found), (0.1 * SIGMA) ** 2 * np.eye(3)
+
+
+def test_narrow_faces_beside_each_other():
+    """Of these 96 faces 52 are found by planes that are drawn there, 57 with those parallel to others, 62 by edges."""
+    number = 0
+    for seed in range(6):
+        points, edges, noise = stairs(seed)
+        each, of_ends = np.broadcast_to(noise, (len(points), 3, 3)), np.broadcast_to(noise, (len(edges), 2, 3, 3))
+        found = find_planes(points, each, edges, of_ends)
+        assert (np.abs(found.planes[:, 1:3]).max(axis=1) > np.cos(0.1)).all()  # no slope through all of them
+        number += len(found)
+    assert number >= 60
+
+
+@pytest.mark.kernels
+def test_candidates_are_parallel_to_planes_beside_them_and_at_right_angles_to_two():
+    rng = np.random.default_rng(3)
+    points = np.concatenate(
+        [wall(rng, 60, axis, 0.0) for axis in range(3)] + [wall(rng, 60, 2, 0.0, shift=(90.0, 0.0))]
+    )
+    features = features_of(points, np.array(noise_of(points)), np.arange(240), np.full(240, -1))
+    wall_of = np.repeat(np.arange(4), 60)[features.given]
+    labels, planes = np.where(wall_of < 2, wall_of, -1), np.array([[1.0, 0, 0, 0], [0.0, 1, 0, 0]])
+    found, homes = from_planes(features, planes, labels, rng)
+    assert np.abs(np.einsum("ni,ni->n", found[:, :3], features.places[homes]) + found[:, 3]).max() < 1e-12
+    assert set(wall_of[homes]) == {2}  # nothing is known beside the wall far away
+    assert {tuple(np.abs(normal)) for normal in found[:, :3].round(12)} == {(1, 0, 0), (0, 1, 0), (0, 0, 1)}
+    near = features.neighbours[homes]
+    for axis in range(2):
+        assert (labels[near[np.abs(found[:, axis]) == 1.0]] == axis).any(axis=1).all()
+    assert len(from_planes(features, planes, np.full(240, -1), rng)[0]) == 0
+    assert len(from_planes(features, planes, np.zeros(240, int), rng)[0]) == 0
 
 
 def test_a_round_body_has_no_plane():

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Covers planes that bend: walls that are flat, rough or bent a little stay planes, pieces of columns are none."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -69,6 +71,21 @@ def test_a_wall_of_panels_does_not_bend():
     steps = 0.02 * np.random.default_rng(2).standard_normal((8, 6))
     height = steps[np.digitize(at[:, 0], np.linspace(-0.8, 0.8, 7)), np.digitize(at[:, 1], np.linspace(-0.4, 0.4, 5))]
     assert not bending(*members(height, at, 2.0), LEVEL).any()
+
+
+def test_tilts_of_lines_on_a_narrow_face_do_not_bend_it():
+    """Edges, each end five deviations off, one above the face, the other below: heavy tails, not a bend."""
+    marks, planes, points, _ = members(np.zeros(60), places(60, (1.0, 0.03)))
+    rng, num = np.random.default_rng(1), 12
+    side = rng.choice([-1.0, 1.0], num)
+    start = np.column_stack([rng.uniform(-0.9, -0.1, num), 0.03 * side, 5.0 * SIGMA * side])
+    segments = np.stack([start, start * [-1.0, 1.0, -1.0]], axis=1)
+    across = np.broadcast_to(np.eye(3)[1:], (num, 2, 3))
+    noise = LineNoise(across, np.broadcast_to(SIGMA**2 * np.eye(4), (num, 4, 4)), np.ones(num), 0.1)
+    marks = replace(marks, segments=segments, line_noise=noise, line_usable=np.ones(num, bool))
+    marks = replace(marks, line_pixel=np.full(num, PIXEL))
+    lines = Pairs(np.column_stack([np.arange(num), np.zeros(num, int)]), np.ones(num), np.zeros(num))
+    assert not bending(marks, planes, points, lines, LEVEL).any()
 
 
 def test_few_members_tell_nothing():

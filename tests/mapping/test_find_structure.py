@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Structure of scenes: planes, directions and relations against the truth of synthetic scenes; noise; real walls."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -13,7 +14,7 @@ from groma.errors import InputError
 from groma.geometry import quaternion
 from groma.io import read_scene
 from groma.mapping.noise.landmarks import line_noise, point_noise
-from groma.mapping.structure.find import StructureOptions, detect_structure, find_structure
+from groma.mapping.structure.find import StructureOptions, detect_structure, find_structure, landmark_noise
 from groma.scene import Directions, Planes, Relations, RightColumns, Scene
 from groma.scene.synthetic.scenes import corridor, holistic
 from groma.solver.options import SolverOptions
@@ -135,6 +136,14 @@ def test_progress_and_what_is_left_out():
     assert (lines >= 2).all()
     assert strict.scene.num_directions < found.num_directions
     assert len(strict.probability["line_along_direction"]) == len(strict.scene.relations.line_along_direction)
+
+
+def test_lines_take_part_with_the_noise_that_they_show():
+    """With residuals four times the usual ones they are known a quarter as well, and still lie on their walls."""
+    _, scene = measured("corridor", "small")
+    points, lines = landmark_noise(scene, StructureOptions())
+    usual, shown = (find_structure(scene, noise=(points, replace(lines, misfit=one * lines.misfit))) for one in (1, 4))
+    assert len(shown.relations.line_on_plane) > 0.8 * len(usual.relations.line_on_plane) > 0
 
 
 def test_points_on_lines():

@@ -105,6 +105,17 @@ def test_a_flat_wall_keeps_its_plane():
         np.testing.assert_array_equal(one.probability, other.probability)
 
 
+def test_heights_of_lines_tell_what_lies_on_a_wall_and_tilts_only_what_crosses_it():
+    """Of one that goes on where nothing is, one end on the wall is enough; of one beside it none is."""
+    marks, up = wall(0.0), np.zeros((6, 2))
+    up[:3] = np.outer([4.0, 4.0, 8.0], [-SIGMA, SIGMA])
+    up[3] = 4.0 * SIGMA
+    marks.segments[:6, :, 2] = up
+    marks.segments[1, :, :2], marks.segments[4, :, :2] = [[1.5, 0.0], [9.0, 0.0]], [[8.0, 0.0], [9.0, 0.0]]
+    _, lines = on_planes(marks, found_in(marks, 0.0), LEVEL, LEAST)
+    assert np.isin(range(6), lines.pairs[:, 0]).tolist() == [True, True, False, False, False, True]
+
+
 def test_a_plane_of_few_members_stays():
     marks = wall(0.004)
     cut = found_in(marks, TILT)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Candidates of :mod:`groma.estimators.plane_search`: planes of neighbouring features, and of near segments.
+"""Candidates of :mod:`groma.estimators.plane_search`: planes of neighbouring features, of near segments, and of planes.
 
 Their number grows with the features, and each looks only at what is near: a scene has the same candidates whether it
 stands alone or is part of a larger one.
@@ -21,7 +21,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators._plane_loops import BALL, height_kernel, least_axis_kernel, lies_on_kernel, variance_kernel
 from groma.estimators._plane_options import PLANE_SEARCH
 from groma.execution import map_in_threads
-from groma.geometry.algebra import dot, norm
+from groma.geometry.algebra import cross, dot, norm
 
 #: Pairs processed together (cost: memory).
 _CHUNK = 4096
@@ -174,6 +174,26 @@ def from_neighbours(
     )  # fmt: skip
     valid = planes[:, :3].any(axis=1)
     return planes[valid], seed[valid]
+
+
+def from_planes(
+    features: Features, planes: FloatArray, labels: IntArray, rng: np.random.Generator
+) -> tuple[FloatArray, IntArray]:
+    """Candidates (H, 4) through free features, parallel to planes (K, 4) that neighbours are on, or at right angles to
+    two of them; their homes (H,).
+    """
+    free = np.flatnonzero(labels < 0)
+    seed = np.sort(rng.permutation(free)[: max(len(free) // PLANE_SEARCH.features_per_seed, PLANE_SEARCH.min_seeds)])
+    label = np.sort(labels[features.neighbours[seed]], axis=1)
+    label = np.sort(np.where(np.diff(label, axis=1, prepend=-1) > 0, label, -1), axis=1)[:, ::-1]
+    first, second = np.triu_indices(max(int((label >= 0).sum(axis=1).max(initial=0)), 1))
+    row, pair = np.nonzero(label[:, second] >= 0)
+    one, other = planes[label[row, first[pair]], :3], planes[label[row, second[pair]], :3]
+    normal = np.where((first == second)[pair, None], one, cross(one, other))
+    size = norm(normal)
+    kept = size > PLANE_SEARCH.crossing
+    normal, homes = normal[kept] / size[kept, None], seed[row[kept]]
+    return np.column_stack([normal, -dot(normal, features.places[homes])]), homes
 
 
 def from_segments(features: Features, corner: IntArray, gate: float) -> tuple[FloatArray, IntArray, int]:

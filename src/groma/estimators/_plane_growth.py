@@ -222,7 +222,8 @@ class Grower:
         rows, layer = self._room[2, :count].copy(), self._room[3, :inner]
         if inner == 0 or share < options.min_share:
             return None, plane, rows
-        alarm, even = self._log10_false_alarms(plane, rows), self._log10_even(inner, band)
+        edges = self._edges(layer[self._on(inner)], labels)
+        alarm, even = self._log10_false_alarms(plane, np.concatenate([rows, edges])), self._log10_even(inner, band)
         if features.rough:  # some thicker layer stands out by chance
             even += self._log_tried
         if max(alarm, even) > np.log10(options.max_false_alarms):
@@ -253,6 +254,11 @@ class Grower:
             self._mark,
         )
         return log10_binomial_tail(inside - 4, number - 3, chance / max(number, 1)) + self._log_tried  # three fix it
+
+    def _edges(self, on: IntArray, labels: IntArray) -> IntArray:
+        """Of what lies on a plane, both ends of segments that were taken out with others: an edge is on two faces."""
+        other = self._features.partner[on]
+        return on[(labels[on] >= 0) & (other != on) & np.isin(other, on)]
 
     def _on(self, inner: int) -> BoolArray:
         """Which of the last layer lie on the plane."""

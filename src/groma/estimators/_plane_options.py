@@ -52,6 +52,7 @@ class PlaneSearchGates:
         24, "segments", "nearest segments that a segment is paired with", "cost: time of a search"
     )
     pairs: int = gate(2, "pairs", "pairs of a segment that become candidates", "cost: time of a search")
+    crossing: float = gate(0.26, "1", "sine of the angle of planes that cross", "convention: 15 degrees")
     not_collinear: float = gate(25.0, "variances", "spread of two segments across the longest axis", _SURVEYED)
     max_followed: int = gate(8192, "features", "features that score a candidate", "cost: time of a search")
     link: float = gate(3.0, "spacings", "links between features on a plane", _SURVEYED)

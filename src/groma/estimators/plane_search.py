@@ -12,6 +12,11 @@ points have their neighbours there anyway. It is kept if
   filled as the fuller side of the layer is. Relief without a flat part has no plane, nor has a thin post one that cuts
   through its sides, nor a round body one that touches it.
 
+Narrow faces, such as treads, have few neighbours on themselves, so that few of the planes drawn are theirs. They are
+parallel to faces beside them, or at right angles to two: such planes through what is left are drawn next, as long as
+any are found. And the edges of a face are on two: what was taken out with another plane counts in the test against
+chance, if it is a segment, both ends of which are on this one, too.
+
 What is left is searched again as rough walls, by features with four times the noise. As neighbours deviate alike on
 these, their number does not make the normal better known: the noise is at most ``max_tilt`` of the spread of the plane
 across its longest axis. Among so many thicker layers some stand out against their sides by chance, so that this test
@@ -34,7 +39,14 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
-from groma.estimators._plane_candidates import Features, Scores, features_of, from_neighbours, from_segments
+from groma.estimators._plane_candidates import (
+    Features,
+    Scores,
+    features_of,
+    from_neighbours,
+    from_planes,
+    from_segments,
+)
 from groma.estimators._plane_growth import Grower, Grown, connected_to
 from groma.estimators._plane_options import PLANE_SEARCH, PlaneOptions
 from groma.gates import chi_square_gate
@@ -165,32 +177,46 @@ def _extract(
     """Find planes, then rough ones; ``filled`` gets their numbers."""
     features, labels = features_of(places, noise, partner, carrier), np.full(len(places), -1)
     found: list[Grown] = []
+    gate, settled = chi_square_gate(1.0 - options.level, 1), 0
+
+    def say(done: int, total: int) -> None:
+        progress(settled + done, settled + total)
+
     for one in (features, features.thicker(PLANE_SEARCH.thicker)):
-        if np.count_nonzero(labels < 0) >= options.min_support:
-            _extract_of(one, num_points, labels, found, options, progress)
+        if np.count_nonzero(labels < 0) < options.min_support:
+            break  # too few are left
+        rng, number = np.random.default_rng(options.seed), -1
+        free, corner = one.position[labels[one.position] < 0], one.position[num_points:].reshape(-1, 2)
+        first, first_homes = from_neighbours(one, free, gate, rng)
+        second, second_homes, num_pairs = from_segments(one, corner[(labels[corner] < 0).all(axis=1)], gate)
+        candidates, homes = np.concatenate([first, second]), np.concatenate([first_homes, second_homes])
+        num_tried = len(first) + num_pairs
+        while number < len(found):
+            number = len(found)
+            _extract_of(one, candidates, homes, num_tried, labels, found, options, say)
+            settled += len(candidates)
+            planes = np.array([grown.fit.plane for grown in found]).reshape(-1, 4)
+            candidates, homes = from_planes(one, planes, labels, rng)
+            num_tried += len(candidates)
     filled[features.given] = labels
     return found
 
 
 def _extract_of(
     features: Features,
-    num_points: int,
+    candidates: FloatArray,
+    homes: IntArray,
+    num_tried: int,
     labels: IntArray,
     found: list[Grown],
     options: PlaneOptions,
     progress: Callable[[int, int], None],
 ) -> None:
     """Find planes one by one, beside those ``found``; ``labels`` and ``found`` are added to."""
-    rng = np.random.default_rng(options.seed)
     gate = chi_square_gate(1.0 - options.level, 1)
-    free = features.position[labels[features.position] < 0]
-    corner = features.position[num_points:].reshape(-1, 2)
-    first, first_homes = from_neighbours(features, free, gate, rng)
-    second, second_homes, num_pairs = from_segments(features, corner[(labels[corner] < 0).all(axis=1)], gate)
-    candidates, homes = np.concatenate([first, second]), np.concatenate([first_homes, second_homes])
     scores = Scores(features, candidates, homes, gate, PLANE_SEARCH.link)
     support, score = scores.of(np.arange(len(candidates)), labels)
-    log_tried = np.log10(2.0 * PLANE_SEARCH.refined * (len(first) + num_pairs) + 1.0)  # two thicknesses
+    log_tried = np.log10(2.0 * PLANE_SEARCH.refined * num_tried + 1.0)  # two thicknesses
     # With less information than the test of false alarms needs, a candidate will be rejected.
     least_score = np.log(10.0) * (log_tried - np.log10(options.max_false_alarms))
     alive = (support >= 0.5 * options.min_support) & (score >= least_score)

@@ -69,8 +69,10 @@ def bending(
             continue
         normal = planes.planes[k, :3]
         variance = np.einsum("i,nij,j->n", normal, noise, normal) + away**2
-        along = places @ np.stack(perpendicular(normal), axis=1)
-        turned, tail = _turned(along, places @ normal + planes.planes[k, 3], weight / variance, gates.members)
+        along, height = places @ np.stack(perpendicular(normal), axis=1), places @ normal + planes.planes[k, 3]
+        ends = height[points.counts(len(planes))[k] :].reshape(-1, 2)
+        ends[:] = ends.mean(axis=1, keepdims=True)  # tilts of lines have heavier tails than the noise of their ends
+        turned, tail = _turned(along, height, weight / variance, gates.members)
         bent[k] = turned > gates.turned and tail < 1.0 - level
     return bent
 

@@ -68,7 +68,8 @@ class StructureOptions:
     min_direction_probability: float = 0.8
     #: Landmarks seen in fewer images take no part: nothing checks their matches. A stereo pair is two images.
     min_views: int = 3
-    #: Landmarks whose reprojection error is so many times the usual one take no part.
+    #: Points whose reprojection error is so many times the usual one take no part. Lines do, with the noise that their
+    #: own residuals show.
     max_misfit: float = 3.0
     #: Deviation of landmarks from the surfaces they lie on, as a length in the images, pixels, that is added to their
     #: noise while planes are sought; how far they deviate beyond that is estimated. For what lies on a plane within
@@ -258,7 +259,8 @@ def landmark_noise(scene: Scene, options: StructureOptions) -> LandmarkNoise:
 
 def _landmarks(scene: Scene, options: StructureOptions, noise: LandmarkNoise | None) -> Landmarks:
     """Points and lines with their noise, and which of them may take part."""
-    points, own = noise or landmark_noise(scene, options)
+    points, usual = noise or landmark_noise(scene, options)
+    own = usual.by_misfit()
     point_pixel, line_pixel = lengths_per_pixel(scene, "point"), lengths_per_pixel(scene, "line")
     points = points.widened(options.surface_sigma_px * point_pixel)
     lines = own.widened(options.surface_sigma_px * line_pixel)
@@ -268,15 +270,15 @@ def _landmarks(scene: Scene, options: StructureOptions, noise: LandmarkNoise | N
     seen = seen + np.bincount(table.point_idx[scene.right_columns.observation_idx], minlength=scene.num_points)
     lines_seen = num_distinct(scene.line_observations.line_idx, scene.line_observations.image_idx, scene.num_lines)
     point_usable = (seen >= options.min_views) & (points.misfit < options.max_misfit)
-    line_usable = (lines_seen >= options.min_views) & (lines.misfit < options.max_misfit)
-    line_usable &= norm(scene.lines.segments[:, 1] - scene.lines.segments[:, 0]) > 0.0
+    length = norm(scene.lines.segments[:, 1] - scene.lines.segments[:, 0])
+    line_usable = (lines_seen >= options.min_views) & (length > 0.0)
     return Landmarks(
         scene.points.xyz,
         points,
         point_usable,
         scene.lines.segments,
         lines,
-        own.by_misfit(),
+        own,
         line_usable,
         point_spacing,
         end_spacing,

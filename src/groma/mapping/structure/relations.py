@@ -171,29 +171,38 @@ def on_planes(
     )
     competing = np.arccos(np.clip(np.abs(found.planes[:, :3] @ found.planes[:, :3].T), 0.0, 1.0)) < GATES.competing
 
-    def related(rows: BoolArray, dof: int, enough: float) -> Pairs:
+    def related(rows: BoolArray, enough: float) -> Pairs:
         deviation = told.deviation[owner[rows]]
-        inner = _on_plane_itself(table[rows], found.band, dof, level, enough)
-        squared = table[rows, 4 : 4 + dof] ** 2 / (table[rows, 6 : 6 + dof] + (deviation * pixel[rows])[:, None] ** 2)
-        passed = (squared.sum(axis=1) < chi_square_gate(1.0 - level, dof)) & (told.probability[rows] > enough)
+        inner = _on_plane_itself(table[rows], found.band, level, enough)
+        passed = _within(table[rows], deviation * pixel[rows], level) & (told.probability[rows] > enough)
         probability = np.where(inner > 0.0, np.maximum(inner, told.probability[rows]), told.probability[rows])
         pairs = np.column_stack([mark, owner])[rows]
         chosen = Pairs(pairs, probability, np.where(inner > 0.0, 0.0, deviation)).take(passed | (inner > 0.0))
         return _best_of_competing(chosen, competing, num)
 
-    points_on, lines_on = together(partial(related, ~is_line, 1, least[0]), partial(related, is_line, 2, least[1]))
+    points_on, lines_on = together(partial(related, ~is_line, least[0]), partial(related, is_line, least[1]))
     return points_on, lines_on
 
 
-def _on_plane_itself(table: FloatArray, band: FloatArray, dof: int, level: float, least: float) -> FloatArray:
+def _on_plane_itself(table: FloatArray, band: FloatArray, level: float, least: float) -> FloatArray:
     """Probability of what lies on a plane within its own noise, against all that is in its band; 0 for the others."""
     owner, height = table[:, 1].astype(np.int64), np.abs(table[:, 2])
-    squared = (table[:, 4 : 4 + dof] ** 2 / table[:, 6 : 6 + dof]).sum(axis=1)
     near, result = np.flatnonzero(height < band[owner]), np.zeros(len(table))
     probability, _ = inlier_probability(height[near], table[near, 3], owner[near], band)
-    passed = (squared[near] < chi_square_gate(1.0 - level, dof)) & (probability > least)
+    passed = _within(table[near], 0.0, level) & (probability > least)
     result[near[passed]] = probability[passed]
     return result
+
+
+def _within(table: FloatArray, away: FloatArray | float, level: float) -> BoolArray:
+    """Whether heights pass the chi-square test, members deviating by a length ``away``, and lines are not turned.
+
+    Heights tell what lies on a plane. Tilts only tell lines that cross it, by more than the band: those of members have
+    heavier tails than the noise of their ends.
+    """
+    square = np.square(away)
+    passed = table[:, 2] ** 2 / (table[:, 3] ** 2 + square) < chi_square_gate(1.0 - level, 1)
+    return np.asarray(passed & (table[:, 4] ** 2 / (table[:, 5] + 2.0 * square) < BAND**2))
 
 
 def _label(of_usable: IntArray, usable: BoolArray) -> IntArray:
@@ -206,7 +215,7 @@ def _label(of_usable: IntArray, usable: BoolArray) -> IntArray:
 def _near_plane(marks: Landmarks, found: PlaneSet, layer: float, known: _Near, k: int) -> tuple[FloatArray, FloatArray]:
     """Points and lines in the layer of a plane, where it is connected.
 
-    Tables of landmark, plane, height and its deviation, whitened axes of the heights: two offsets, two variances.
+    Tables of landmark, plane, height and its deviation, difference of the heights of both ends and its variance.
     """
     same = found.planes[k].tobytes(), found.covariance[k].tobytes(), float(found.band[k]), found.places[k].tobytes()
     if same not in known:
@@ -227,12 +236,11 @@ def _in_layer(
     lines, ends = usable_lines[near], ends[near]
     spacing = np.concatenate([marks.point_spacing[rows], marks.end_spacing[lines].ravel()])
     near = connected_to(places, np.concatenate([at, ends.reshape(-1, 3)]), spacing, plane)
-    lines, rows = lines[near[len(rows) :].reshape(-1, 2).all(axis=1)], rows[near[: len(rows)]]
+    lines, rows = lines[near[len(rows) :].reshape(-1, 2).any(axis=1)], rows[near[: len(rows)]]
     height, variance = _point_heights(marks, rows, plane, covariance)
-    unused = np.zeros(len(rows))
-    points = np.column_stack([rows.astype(np.float64), height, np.sqrt(variance), height, unused, variance, unused])
-    height, spread, offset, variance = _line_heights(marks, lines, plane, covariance)
-    return points, np.column_stack([lines.astype(np.float64), height, spread, offset, variance])
+    unused = np.zeros(len(rows)), np.ones(len(rows))
+    points = np.column_stack([rows.astype(np.float64), height, np.sqrt(variance), *unused])
+    return points, np.column_stack([lines.astype(np.float64), *_line_heights(marks, lines, plane, covariance)])
 
 
 def on_lines(marks: Landmarks, level: float, least: float) -> Pairs:
@@ -283,11 +291,10 @@ def _point_heights(
 def _line_heights(
     marks: Landmarks, rows: IntArray, plane: FloatArray, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Height of the segment where it is known best, its deviation, and along the axes of the noise of the heights of
-    both ends offsets (n, 2) and variances (n, 2).
+    """Height of the segment where it is known best and its deviation; the difference of both ends and its variance.
 
-    Clutter beside a plane is often parallel to it (mouldings, frames), so that the height of a segment tells it from
-    what lies on the plane, and its tilt does not: the mixture looks at the one, the chi-square test at both.
+    Clutter beside a plane is often parallel to it (mouldings, frames): the height of a segment tells it from what lies
+    on the plane, and its tilt does not.
     """
     ends = marks.segments[rows]
     height = ends @ plane[:3] + plane[3]
@@ -298,11 +305,9 @@ def _line_heights(
     noise += np.einsum("nei,ij,nfj->nef", lever, covariance, lever)
     size = np.trace(noise, axis1=1, axis2=2)
     noise = noise + (1e-9 * size + 1e-300)[:, None, None] * np.eye(2)
-    variance, axes = np.linalg.eigh(noise)
     weight = np.linalg.solve(noise, np.ones((len(rows), 2, 1)))[..., 0]
-    information = weight.sum(axis=1)
-    offset = np.einsum("neb,ne->nb", axes, height)
-    return (weight * height).sum(axis=1) / information, 1.0 / np.sqrt(information), offset, variance
+    information, turned = weight.sum(axis=1), noise[:, 0, 0] + noise[:, 1, 1] - 2.0 * noise[:, 0, 1]
+    return (weight * height).sum(axis=1) / information, 1.0 / np.sqrt(information), height[:, 1] - height[:, 0], turned
 
 
 def _near_segments(points: FloatArray, segments: FloatArray) -> IntArray:
