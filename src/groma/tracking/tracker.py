@@ -150,14 +150,14 @@ class Tracker:
         if reason:
             return self._skip(frame, reason, began)
         present, mapper = self._present, self._mapper
-        data = self._ahead.take(frame)
-        self._ahead.announce(following, mapper.frame_pool, mapper.workers if self._searched else None)
+        data = self._ahead.take(frame, mapper.frame_pool, mapper.workers if self._searched else None)
         with watch("map"):
             self._settle()
         if not self.map.keyframes:
             return self._answer(self._start(data, began, watch))
         attempt, found = self._follow(data, watch), None
         self._searched = attempt.estimate is None
+        self._ahead.announce(following, mapper.frame_pool, mapper.workers if self._searched else None)
         if self._searched:
             attempt, found = self._search(data, attempt, watch)
         estimate, followed = attempt.estimate, attempt.followed
