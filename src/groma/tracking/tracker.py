@@ -80,7 +80,7 @@ class Tracker:
         self._given, self.camera = camera, TrackCamera.of(camera)
         self.status = STARTING
         self._gates = self.options.gates.verification
-        self._checks = FrameChecks(self.camera, self.options.gates.checks)
+        self._checks = FrameChecks(self.camera, self.options.gates.checks, self.options.max_depth)
         self._motion = MotionModel(self.options.gates.motion)
         self._initialiser: Initialiser | None = None
         self._saved = saved
