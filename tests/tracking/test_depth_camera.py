@@ -9,7 +9,7 @@ import pytest
 
 from groma.geometry import se3
 from groma.tracking import Tracker, TrackOptions
-from groma.tracking.backend.depth_calibration import correct_depths
+from groma.tracking.backend.depth_calibration import correct_depths, depths_that_do_not_fit
 from groma.tracking.frame.camera import planes_into
 
 COUNT = 40
@@ -49,6 +49,23 @@ def test_right_depths_stay(frames):
     assert abs(found["inverse_offset"]) < 0.002
     assert found["sigma"] < 0.002
     assert not any("disagree" in sentence for sentence in result.warnings)
+
+
+def test_depths_that_do_not_fit_the_points_are_told(frames):
+    """Depths of a finished map are put off, to both sides in turn, by half of their noise and by three times that."""
+    track_map = _tracked(frames[:16], 0.0)[0].map
+    gates = TrackOptions().gates.depth
+    assert len(track_map.living()) >= 3
+    assert depths_that_do_not_fit(track_map, gates) == []
+    for sigmas, told in ((0.5, 0), (3.0, 1)):
+        off = track_map.copy()
+        for keyframe in off.living():
+            points = keyframe.measured.points
+            away = sigmas * points.depth_sigma * np.where(np.arange(len(points)) % 2, 1.0, -1.0)
+            keyframe.measured = replace(keyframe.measured, points=replace(points, depth=points.depth + away))
+        assert len(depths_that_do_not_fit(off, gates)) == told
+    few = replace(gates, min_depths=10**6)
+    assert depths_that_do_not_fit(off, few) == []
 
 
 def test_an_offset_beyond_all_noise_is_told_and_not_used(frames):

@@ -106,6 +106,7 @@ def test_nothing_tracked_is_said_in_one_line(sequence, tmp_path):
     result = _run(sequence, "-o", tmp_path / "still", "--camera", CAMERA, "--kind", "mono", "--max-frames", 1)
     assert result.exit_code == 1
     assert "No frame of" in result.output
+    assert "depth scale" not in result.output  # one camera has none
     assert not (tmp_path / "still").exists()
 
 

@@ -178,6 +178,16 @@ def test_holes_in_depth(rgbd, truth):
     assert _room.position_error(result.trajectory, truth) < 0.02
 
 
+def test_depths_of_a_wrong_unit_are_told(rgbd):
+    """Depths of ten times the unit lie beyond what is used; of a tenth of it they do not."""
+    far = [dataclasses.replace(frame, depth=10.0 * frame.depth) for frame in rgbd[:3]]
+    result = _run(far)[1]
+    assert not len(result.trajectory)
+    assert [warning for warning in result.warnings if warning.startswith("3 frames had depth of up to 6 m")]
+    near = [dataclasses.replace(frame, depth=np.float32(0.1) * frame.depth) for frame in rgbd[:3]]
+    assert not any("depth of up to" in warning for warning in _run(near)[1].warnings)
+
+
 def test_frozen_and_missing_frames(rgbd, truth):
     frozen = [dataclasses.replace(rgbd[8], timestamp=frame.timestamp) if 8 <= k < 11 else frame
               for k, frame in enumerate(rgbd[:20])]  # fmt: skip

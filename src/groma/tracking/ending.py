@@ -17,6 +17,7 @@ import numpy as np
 from groma.errors import is_interrupt
 from groma.io.trajectories import Trajectory
 from groma.solver.report import SolveReport
+from groma.tracking.backend.depth_calibration import depths_that_do_not_fit
 from groma.tracking.backend.mapper import Mapper, Present
 from groma.tracking.backend.plane_outcome import PlaneOutcome
 from groma.tracking.backend.submaps import Joint, Places, Submap, best_joint
@@ -126,8 +127,11 @@ class Ending:
         report, turn = self.attempt(
             "the adjustment of all keyframes", lambda: mapper.adjust_at_end(number), (None, turn), changes=(number,)
         )
-        if mapper.depth_offset is not None:
-            self.warnings += [one for one in mapper.depth_offset.warnings() if one not in self.warnings]
+        told = [] if mapper.depth_offset is None else mapper.depth_offset.warnings()
+        if not told and not mapper.camera.baseline > 0 and mapper.map.living():
+            gates = mapper.options.gates.depth
+            told = self.attempt("whether depths fit", lambda: depths_that_do_not_fit(mapper.map, gates), [], changes=())
+        self.warnings += [one for one in told if one not in self.warnings]
         what = "the planes of the map's points and lines"
         again, planes = self.attempt(what, lambda: mapper.adjust_with_planes(number), (None, None), (number,))
         report = again or report

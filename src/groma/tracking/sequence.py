@@ -207,9 +207,8 @@ def track(
     warnings = [*sequence.warnings, *result.warnings, *_without_pose(frames)]
     if not len(result.trajectory):
         what = "could be tracked" if earlier is None else f"was found in the map {earlier.path}"
-        raise InputError(
-            f"No frame of {name or 'the sequence'} {what}: {' '.join(warnings)} Check the camera and the depth scale."
-        )
+        check = "Check the camera and the depth scale." if sequence.kind == "rgbd" else "Check the camera."
+        raise InputError(f"No frame of {name or 'the sequence'} {what}: {' '.join(warnings)} {check}")
     if result.submaps:
         folders = ", ".join(f"submap_{number}" for number in range(2, len(result.submaps) + 2))
         warnings.append(f"Only the longest submap is in trajectory.txt and the report; see also {folders}.")

@@ -80,7 +80,7 @@ class Tracker:
         self._given, self.camera = camera, TrackCamera.of(camera)
         self.status = STARTING
         self._gates = self.options.gates.verification
-        self._checks = FrameChecks(self.camera, self.options.gates.checks)
+        self._checks = FrameChecks(self.camera, self.options.gates.checks, self.options.max_depth)
         self._motion = MotionModel(self.options.gates.motion)
         self._initialiser: Initialiser | None = None
         self._saved = saved
@@ -150,14 +150,14 @@ class Tracker:
         if reason:
             return self._skip(frame, reason, began)
         present, mapper = self._present, self._mapper
-        data = self._ahead.take(frame)
-        self._ahead.announce(following, mapper.frame_pool, mapper.workers if self._searched else None)
+        data = self._ahead.take(frame, mapper.frame_pool, mapper.workers if self._searched else None)
         with watch("map"):
             self._settle()
         if not self.map.keyframes:
             return self._answer(self._start(data, began, watch))
         attempt, found = self._follow(data, watch), None
         self._searched = attempt.estimate is None
+        self._ahead.announce(following, mapper.frame_pool, mapper.workers if self._searched else None)
         if self._searched:
             attempt, found = self._search(data, attempt, watch)
         estimate, followed = attempt.estimate, attempt.followed

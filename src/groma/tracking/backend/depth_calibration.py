@@ -31,12 +31,15 @@ from groma.problem.residuals import squared_norms
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 from groma.tracking.backend.local_adjustment import job_of
-from groma.tracking.frame.camera import TrackCamera
+from groma.tracking.frame.camera import TrackCamera, into
+from groma.tracking.gates import DepthGates
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.options import TrackOptions
 
 #: Step of the differences of costs, of the deviation known beforehand.
 _STEP = 0.05
+#: Half of all values that are distributed normally are within so many standard deviations (belongs to mathematics).
+MEDIAN_OF_NORMAL = 0.6745
 
 
 @dataclass(frozen=True)
@@ -94,6 +97,30 @@ def estimate_depth_offset(track_map: TrackMap, camera: TrackCamera, options: Tra
 def has_depths(track_map: TrackMap) -> bool:
     """Whether keyframes measured depths themselves."""
     return any(np.isfinite(keyframe.measured.points.depth).any() for keyframe in track_map.living())
+
+
+def depths_that_do_not_fit(track_map: TrackMap, gates: DepthGates) -> list[str]:
+    """Say so where the depths of points are far from where three and more images have the points of a map.
+
+    The median deviation tells: depths beside edges, up to a tenth of all, are off in good sequences, too.
+    """
+    living, points = track_map.living(), track_map.points
+    tables = [track_map.living_measurements(keyframe).points for keyframe in living]
+    seen = np.bincount(np.concatenate([table.index for table in tables]), minlength=len(points))
+    off = []
+    for keyframe, table in zip(living, tables, strict=True):
+        told = np.isfinite(table.depth) & (seen[table.index] >= 3)
+        depth = into(keyframe.pose, points.xyz[table.index[told]])[:, 2]
+        off.append(np.abs(depth - table.depth[told]) / table.depth_sigma[told])
+    every = np.concatenate(off)
+    median = float(np.median(every)) if len(every) >= gates.min_depths else 0.0
+    if median <= gates.max_misfit * MEDIAN_OF_NORMAL:
+        return []
+    return [
+        f"Depths and images disagree: half of the depths are more than {median:.1f} standard deviations from where the "
+        f"images have their points ({MEDIAN_OF_NORMAL:.1f} expected). Check that depths belong to the pixels of the "
+        "images, and are of the same time."
+    ]
 
 
 class _Maps:

@@ -5,16 +5,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
 from groma._typing import FloatArray
 from groma.geometry import se3
 from groma.solver.report import SolveReport
-from groma.tracking.backend.behind import OnDemand
 from groma.tracking.backend.depth_calibration import DepthOffset, correct_depths, estimate_depth_offset
 from groma.tracking.backend.local_adjustment import AdjustmentJob, job_of, window_job
 from groma.tracking.backend.loop_closure import LoopSearch, search_for_loop
@@ -23,6 +21,7 @@ from groma.tracking.backend.plane_outcome import PlaneOutcome, drop_what_failed
 from groma.tracking.backend.scaled_loops import close_scaled_loops
 from groma.tracking.backend.stereo_calibration import correct_map, estimate_turn, shift_between, tells_yaw
 from groma.tracking.backend.submaps import Joint, find_joint, search_older_maps
+from groma.tracking.beside import beside
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.features import FrameFeatures
 from groma.tracking.frame.rectification import RightCamera, RightTurn
@@ -70,7 +69,7 @@ class _Chosen:
 @dataclass
 class _Pending:
     job: AdjustmentJob
-    future: Future | OnDemand
+    finish: Callable[[], None]
     due: int
 
 
@@ -108,7 +107,7 @@ class Mapper:
         #: For the work of frames, which must not wait for keyframes.
         self.frame_pool = ThreadPoolExecutor(1, thread_name_prefix="groma-frame") if options.threaded else None
         self._pending: _Pending | None = None
-        self._search: tuple[LoopSearch, Future | OnDemand] | None = None
+        self._search: tuple[LoopSearch, Callable[[], list]] | None = None
 
     @property
     def map(self) -> TrackMap:
@@ -230,18 +229,15 @@ class Mapper:
         with watch("adjust"):
             job = window_job(self.map, self.camera, self.options.window, self.options.relations, self.metric)
             if job is not None:
-                self._pending = _Pending(job, self._begin(job.solve), self.options.gates.keyframes.delay)
+                self._pending = _Pending(job, beside(self._pool, job.solve), self.options.gates.keyframes.delay)
         with watch("loop"):
             search = self._what_to_search() if self.options.close_loops else None
             if search is not None and self._search is None:
-                self._search = (search, self._begin(search.run))
+                self._search = (search, beside(self.workers, search.run))
         with watch("culling"):
             drop_unseen(self.map, self.options.gates.points.max_misses)
             busy = self._pending.job.keyframes if self._pending else []
             drop_repeating_keyframes(self.map, busy, self.options.gates.culling)
-
-    def _begin(self, work: Callable[[], Any]) -> Future | OnDemand:
-        return OnDemand(work) if self._pool is None else self._pool.submit(work)
 
     def take_up(self, present: Present, now: bool = False) -> None:
         """Apply the result of the adjustment when it is due, then that of the loop search."""
@@ -250,13 +246,13 @@ class Mapper:
             if self._pending.due > 0 and not now:
                 return
             pending, self._pending = self._pending, None
-            pending.future.result()
+            pending.finish()
             self.apply(present, pending.job)
 
         # Loops are closed between adjustments, whose results would undo them.
         if self._search is not None:
-            (search, future), self._search = self._search, None
-            self._close_loop(present, search, future.result())
+            (search, found), self._search = self._search, None
+            self._close_loop(present, search, found())
 
     def _what_to_search(self) -> LoopSearch | None:
         """Search the older submaps until this one is joined to one of them, then this submap for loops."""

@@ -17,8 +17,8 @@ from groma.tracking.gates import DEFAULT, CheckGates
 class FrameChecks:
     """Checks frames one by one, and collects the warnings."""
 
-    def __init__(self, camera: TrackCamera, gates: CheckGates = DEFAULT.checks) -> None:
-        self._camera, self._gates = camera, gates
+    def __init__(self, camera: TrackCamera, gates: CheckGates = DEFAULT.checks, max_depth: float = math.inf) -> None:
+        self._camera, self._gates, self._max_depth = camera, gates, max_depth
         self._last_time = -math.inf
         self._last_small: np.ndarray | None = None
         self._counts: dict[str, int] = {}
@@ -42,9 +42,15 @@ class FrameChecks:
                     self._count("repeated the picture before")
                 self._last_small = small
                 if frame.depth is not None:
-                    known = float((frame.depth[::8, ::8] > 0).mean())
-                    if known < self._gates.sparse_depth:
+                    depth = frame.depth[::8, ::8]
+                    known = depth > 0
+                    if float(known.mean()) < self._gates.sparse_depth:
                         self._count("had depth in less than a fifth of the picture")
+                    elif float((known & (depth <= self._max_depth)).mean()) < self._gates.sparse_depth:
+                        self._count(
+                            f"had depth of up to {self._max_depth:g} m, the largest that is used, in less than a fifth "
+                            "of the picture: check the depth scale (--depth-scale), or raise --max-depth (max_depth=)"
+                        )
         if reason:
             self._count(f"skipped: {reason}")
         return reason

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, replace
 from functools import cache
@@ -149,18 +149,27 @@ class FrameFeatures:
 
     def prepare(self, pool: Executor) -> None:
         """Start the computations for a keyframe in other threads; :meth:`wait` ends them."""
-        wanted = {"features": True, "detected": self.options.lines, "corners": self.options.points}
-        names = [name for name, is_wanted in wanted.items() if is_wanted and name not in vars(self)]
-        self._work += [pool.submit(getattr, self, name) for name in names]
+        self._work += [pool.submit(getattr, self, name) for name in self._missing()]
 
     def prepare_ahead(self, pool: Executor, searching: Executor | None = None) -> None:
-        """Start computations of this image alone in other threads, with an executor those of a relocalisation, too."""
+        """Start computations of this image alone in another thread, with an executor those of a relocalisation, too.
+
+        Those are done one after another, since the frame before needs the other cores.
+        """
         if self.frame.right is not None:  # the estimated rotation of that camera may change
             return
-        for name in ("planes", "small"):
-            pool.submit(getattr, self, name)
+        pool.submit(self._find, ("planes", "small"))
         if searching is not None:
-            self.prepare(searching)
+            searching.submit(self._find, self._missing())
+
+    def _missing(self) -> list[str]:
+        """What a keyframe needs and is not found yet."""
+        wanted = {"features": True, "detected": self.options.lines, "corners": self.options.points}
+        return [name for name, is_wanted in wanted.items() if is_wanted and name not in vars(self)]
+
+    def _find(self, names: Sequence[str]) -> None:
+        for name in names:
+            getattr(self, name)
 
     def wait(self) -> None:
         """Wait for the computations that :meth:`prepare` started; others follow on access."""

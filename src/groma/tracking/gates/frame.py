@@ -63,6 +63,13 @@ class DepthGates:
     max_offset: float = gate(
         3.0, "sigma", "offset of inverse depths that is believed", "derived from normal noise: 1 in 370"
     )
+    max_misfit: float = gate(
+        2.0,
+        "ratio",
+        "noise of depths to that stated, above which they are said not to fit",
+        "convention: a sentence only",
+    )
+    min_depths: int = gate(100, "depths", "that tell this noise", "derived from normal noise: known to an eighth")
     grid: int = gate(20, "px", "distance of the places whose depth is kept, and on planes", "cost: 768 in 640 x 480")
     far_share: float = gate(
         0.25, "share", "largest noise of a stereo depth; far points serve as well as near ones", SEQUENCES
