@@ -54,15 +54,14 @@ def dense(problem):
 
 
 def small(rng, seed=1, alone=False):
-    """A small scene with every kind of measurement, adjusted by least squares; a control point has one mark alone."""
+    """A small scene with every kind of measurement, adjusted by least squares; control points may have one mark each."""
     truth, _ = made(6, seed=seed)
     truth = truth.keep(points=np.arange(truth.num_points) < 60)
     scene = with_objects(with_everything(truth, rng), rng)
     if alone:
-        of_point = scene.control_points.is_control[scene.marks.point_idx].argmax()
-        others = scene.marks.point_idx != scene.marks.point_idx[of_point]
-        others[of_point] = True
-        scene = scene.replace(marks=scene.marks.take(np.flatnonzero(others)))
+        kept = ~scene.control_points.is_control[scene.marks.point_idx]
+        kept[np.unique(scene.marks.point_idx, return_index=True)[1]] = True
+        scene = scene.replace(marks=scene.marks.take(np.flatnonzero(kept)))
     result = adjust(scene, replace(LEAST_SQUARES, function_tolerance=1e-12))
     return truth, result
 
