@@ -151,9 +151,13 @@ def images_left_out(names: Sequence[str], used: Sequence[str], model_given: bool
     left = sorted(set(names) - set(used))
     if not left:
         return []
+    one = len(left) == 1
+    why = f"{'has' if one else 'have'} no pose in the model" if model_given else "could not be placed"
     remedy = " They share too few points with the others: take images between them, or pass a --model."
-    have = "has no pose in the model and was" if len(left) == 1 else "have no pose in the model and were"
-    return [f"{len(left)} of {len(names)} images {have} not used: {first_of(left, 3)}.{'' if model_given else remedy}"]
+    return [
+        f"{len(left)} of {len(names)} images {why} and {'was' if one else 'were'} not used: {first_of(left, 3)}."
+        + ("" if model_given else remedy)
+    ]
 
 
 def _suggestion(folder: Path, names: Sequence[str], missing: list[str]) -> str:
