@@ -54,7 +54,7 @@ def dense(problem):
 
 
 def small(rng, seed=1, alone=False):
-    """A small scene with every kind of measurement, adjusted by least squares; control points have one mark if alone."""
+    """A small scene with every kind of measurement, by least squares; control points have one mark if alone."""
     truth, _ = made(6, seed=seed)
     truth = truth.keep(points=np.arange(truth.num_points) < 60)
     scene = with_objects(with_everything(truth, rng), rng)
