@@ -44,6 +44,8 @@ class Surveyed:
     notes: tuple[str, ...] = ()
     #: The fit of the similarity; None where the scene was not moved, or not by places.
     alignment: RobustSimilarity | None = field(default=None)
+    #: Names of the places that it is a fit to.
+    names: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON."""
@@ -98,7 +100,7 @@ def with_survey(scene: Scene, survey: Survey) -> Surveyed:
             "The given poses are in another frame than the measurements: they placed the photographs, and weigh "
             "nothing beside the measurements."
         )
-    return Surveyed(moved, found.similarity, frame, tuple(notes), found.fit)
+    return Surveyed(moved, found.similarity, frame, tuple(notes), found.fit, found.names)
 
 
 def check_survey(survey: Survey, names: Sequence[str], sizes: npt.ArrayLike) -> None:
