@@ -290,6 +290,11 @@ def test_a_scene_is_aligned_with_measurements(truth_and_start):
     found = align(truth.transformed(ELSEWHERE), given)
     assert found.names == (*truth.images.names, "p0", "p1", "p2", "p3") and found.rmse < 4 * SIGMA
     assert len(found.scene.camera_positions) == 0 and len(found.to_dict()["residuals"]) == 12
+    kept = (points.point_idx != 0) | (np.arange(len(points.point_idx)) == np.argmax(points.point_idx == 0))
+    names = tuple(name for name, row in zip(points.image_names, kept, strict=True) if row)
+    single = replace(points, image_names=names, point_idx=points.point_idx[kept], pixels=points.pixels[kept])
+    found = align(truth.transformed(ELSEWHERE), replace(given, control=single))
+    assert found.names[-3:] == ("p1", "p2", "p3")  # a single mark gives p0 no place in the scene
     with pytest.raises(InputError, match="none of its 8 names"):
         align(truth, truth.replace(images=truth.images.replace(names=tuple("abcdefgh"))))
 

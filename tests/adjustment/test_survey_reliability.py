@@ -53,17 +53,22 @@ def dense(problem):
     return np.concatenate(rows), np.concatenate(residuals), where
 
 
-def small(rng, seed=1):
-    """A small scene with every kind of measurement, adjusted by least squares."""
+def small(rng, seed=1, alone=False):
+    """A small scene with every kind of measurement, by least squares; control points have one mark if alone."""
     truth, _ = made(6, seed=seed)
     truth = truth.keep(points=np.arange(truth.num_points) < 60)
     scene = with_objects(with_everything(truth, rng), rng)
+    if alone:
+        kept = ~scene.control_points.is_control[scene.marks.point_idx]
+        kept[np.unique(scene.marks.point_idx, return_index=True)[1]] = True
+        scene = scene.replace(marks=scene.marks.take(np.flatnonzero(kept)))
     result = adjust(scene, replace(LEAST_SQUARES, function_tolerance=1e-12))
     return truth, result
 
 
-def test_redundancy_numbers_and_tests_are_those_of_the_dense_adjustment():
-    _, result = small(np.random.default_rng(0))
+@pytest.mark.parametrize("alone", [False, True])
+def test_redundancy_numbers_and_tests_are_those_of_the_dense_adjustment(alone):
+    _, result = small(np.random.default_rng(0), alone=alone)
     found = reliability(result.scene, result.problem)
     A, b, where = dense(result.problem)
     hat = A @ np.linalg.solve(A.T @ A, A.T)

@@ -148,6 +148,30 @@ def test_what_does_not_fit_is_one_line(folder, tmp_path, capsys, monkeypatch, op
     assert words in error[-1] and len(error) == 1
 
 
+@pytest.mark.parametrize(
+    ("options", "scale", "words"),
+    [
+        ("--control {folder}/gcp_list.txt", 1, "--control-sigma 0.02"),
+        ("--control {folder}/gcp_list.txt --control-sigma 0.02", 2, "outside of their images"),
+        ("--control {folder}/gcp_list.txt --control-sigma 0.02 --check q1", 1, "no control point"),
+        ("--positions {folder}/positions.txt --position-sigma 1 --crs utm", 1, "does not say its coordinate"),
+    ],
+)
+def test_what_does_not_fit_the_photographs_is_refused_before_cameras_are_placed(
+    folder, tmp_path, capsys, monkeypatch, options, scale, words
+):
+    def never(*_):
+        raise AssertionError("cameras were placed")
+
+    monkeypatch.setattr(mapping, "start_of", never)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "images").mkdir()
+    for name in made()[0].images.names:
+        cv2.imwrite(str(tmp_path / "images" / name), np.zeros((768 // scale, 1024 // scale), np.uint8))
+    assert run(["map", "images", "-o", "out", *options.format(folder=folder).split()]) == 1
+    assert words in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("kept", [False, True])
 def test_a_map_is_in_the_frame_of_its_measurements(tmp_path, monkeypatch, kept):
     """What is between the points and the end is looked at without photographs. One position is wrong."""

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Photographs of a fisheye of ninety degrees to its corners, rendered and mapped: lines on the walls they show."""
+"""Photographs of a fisheye of ninety degrees to its corners, rendered: its calibration, and lines on the walls."""
 
 import _facade
 import numpy as np
+import pytest
 
+from groma.evaluation.poses import evaluate_poses
+from groma.io.colmap.sfm import PointModelOptions, reconstruct_points
 from groma.mapping.map import map_images
 from groma.mapping.options import MapOptions
 
@@ -20,3 +23,14 @@ def test_a_fisheye_is_mapped(tmp_path, monkeypatch):
     assert np.median(np.min(away, axis=0)) < 0.02
     assert np.quantile(np.min(away, axis=0), 0.9) < 0.08
     assert set(result.scene.cameras.models) == {"SIMPLE_RADIAL_FISHEYE"}
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_RADIAL_FISHEYE", "OPENCV_FISHEYE"])
+def test_photographs_of_a_fisheye_that_nobody_calibrated_are_placed(tmp_path, monkeypatch, model):
+    """The walls are 5 units away, where half a pixel of one image is 0.01; the first guess is a focal length of 191."""
+    monkeypatch.setattr(_facade, "FOCAL", 220.0)
+    scene = _facade.facade(tmp_path / "images", 5, model="SIMPLE_RADIAL_FISHEYE", extra=(-0.02,))
+    options = PointModelOptions(camera_model=model, threads=1)
+    found = reconstruct_points(tmp_path / "images", tmp_path / "work", scene.images.names, options)
+    assert found.num_images == 5 and found.cameras.params[0, 0] == pytest.approx(220.0, rel=0.01)
+    assert evaluate_poses(found, scene).center_rmse < 0.01

@@ -31,6 +31,7 @@ from groma._typing import FloatArray
 from groma._version import __version__
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult
+from groma.adjustment.survey.attach import check_survey
 from groma.adjustment.survey.given import Survey
 from groma.execution import begin, work_with
 from groma.features.close_edges import CloseEdges
@@ -152,7 +153,9 @@ def map_images(
         model = model.transformed(near)
     read_by_rows(model or Scene(), options, depth)  # refuses depths beside it before anything is computed
     check_number(folder, names, model, options.lines.min_images)
-    check_images(folder, names, model, say)
+    sizes = check_images(folder, names, model, say)
+    if survey:
+        check_survey(survey, tuple(sizes), list(sizes.values()))
     key = digest(__version__, digest_files(folder, files), model)
     with one_blas_thread(), work_with(options.threads), Stages(Path(work), key, options, say) as stages:
         placed = start_of(folder, names, model, stages)

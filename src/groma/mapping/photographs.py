@@ -151,9 +151,13 @@ def images_left_out(names: Sequence[str], used: Sequence[str], model_given: bool
     left = sorted(set(names) - set(used))
     if not left:
         return []
+    one = len(left) == 1
+    why = f"{'has' if one else 'have'} no pose in the model" if model_given else "could not be placed"
     remedy = " They share too few points with the others: take images between them, or pass a --model."
-    have = "has no pose in the model and was" if len(left) == 1 else "have no pose in the model and were"
-    return [f"{len(left)} of {len(names)} images {have} not used: {first_of(left, 3)}.{'' if model_given else remedy}"]
+    return [
+        f"{len(left)} of {len(names)} images {why} and {'was' if one else 'were'} not used: {first_of(left, 3)}."
+        + ("" if model_given else remedy)
+    ]
 
 
 def _suggestion(folder: Path, names: Sequence[str], missing: list[str]) -> str:
@@ -179,20 +183,28 @@ def _suggestion(folder: Path, names: Sequence[str], missing: list[str]) -> str:
     return "Pass the folder the model was made from; names must match."
 
 
-def check_images(folder: Path, names: Sequence[str], model: Scene | None, say: Callable[[str, int, int], None]) -> None:
-    """Check that every image of the model, or of the folder, can be read, and has the size of its camera."""
+def check_images(
+    folder: Path, names: Sequence[str], model: Scene | None, say: Callable[[str, int, int], None]
+) -> dict[str, tuple[int, int]]:
+    """Check that every image of the model, or of the folder, can be read, and has the size of its camera.
+
+    Returns
+    -------
+    dict
+        Width and height of the images by name.
+    """
     sizes = {} if model is None else _sizes(model)
     used = names if model is None else model.images.names
     work = [(folder / name, sizes.get(name, (0, 0))) for name in used]
-    map_work(_check_image, work, partial(say, "checking images"))
+    return dict(zip(used, map_work(_check_image, work, partial(say, "checking images")), strict=True))
 
 
-def _check_image(image: tuple[Path, tuple[int, int]]) -> None:
-    """Check that an image can be read and has the size of its camera, where that is known."""
+def _check_image(image: tuple[Path, tuple[int, int]]) -> tuple[int, int]:
+    """Check that an image can be read and has the size of its camera, where that is known; return its own."""
     path, size = image
     height, width = read_gray(path).shape
     if size in ((0, 0), (width, height)):
-        return
+        return width, height
     remedy = "Pass the images the model was made from."
     if size == (height, width):
         remedy = "It is turned by 90 degrees: pass the images as they were stored when the model was made."

@@ -115,10 +115,5 @@ def _to_survey(scene: Scene, survey: Survey) -> Alignment:
     found = with_survey(scene, survey)
     if found.alignment is None:
         raise InputError("Positions or control points are needed to align with; the scene may hold some already.")
-    names = [scene.images.names[row] for row in found.scene.camera_positions.image_idx] if survey.positions else []
-    fit = found.alignment
-    points = found.scene.control_points
-    rows = np.flatnonzero(points.is_control)[: len(fit.inliers) - len(names)] if survey.control else []
-    names += [points.names[row] for row in rows]
-    moved = scene.transformed(found.similarity)
-    return Alignment(moved, found.similarity, tuple(names), fit.residuals, fit.inliers, None, found.notes)
+    fit, moved = found.alignment, scene.transformed(found.similarity)
+    return Alignment(moved, found.similarity, found.names, fit.residuals, fit.inliers, None, found.notes)

@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from groma._typing import BoolArray
 from groma.adjustment.survey.given import Survey
@@ -23,8 +25,9 @@ from groma.adjustment.survey.similarity import RobustSimilarity
 from groma.adjustment.survey.tables import control_tables, position_table
 from groma.adjustment.survey.triangulate import triangulated
 from groma.adjustment.terms.objects import name_of
+from groma.geometry import se3
 from groma.io.survey import WorldFrame, common_frame
-from groma.scene import PosePriors, Scene, Similarity
+from groma.scene import Cameras, PosePriors, Scene, Similarity
 from groma.scene.survey import rejected_rows, with_rejected
 
 
@@ -41,6 +44,8 @@ class Surveyed:
     notes: tuple[str, ...] = ()
     #: The fit of the similarity; None where the scene was not moved, or not by places.
     alignment: RobustSimilarity | None = field(default=None)
+    #: Names of the places that it is a fit to.
+    names: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON."""
@@ -77,16 +82,7 @@ def with_survey(scene: Scene, survey: Survey) -> Surveyed:
         If names are unknown, coordinate systems or axes do not fit, or accuracies are missing.
     """
     notes: list[str] = []
-    groups = [group for group in (survey.positions, survey.control and survey.control.places) if group is not None]
-    places, frame = common_frame(groups, survey.crs)
-    for group in groups:
-        notes += group.notes
-    measured = scene
-    if survey.positions is not None:
-        measured = measured.replace(camera_positions=position_table(scene, survey, places[0], notes))
-    if survey.control is not None:
-        points, marks = control_tables(scene, survey, survey.control, places[-1], notes)
-        measured = measured.replace(control_points=points, marks=marks)
+    measured, frame = _with_places(scene, survey, notes)
     measured = _with_objects(measured, survey, notes)
     found = placing(scene, measured, survey, frame, notes)
     moved = measured.transformed(found.similarity, measured=False)
@@ -104,7 +100,48 @@ def with_survey(scene: Scene, survey: Survey) -> Surveyed:
             "The given poses are in another frame than the measurements: they placed the photographs, and weigh "
             "nothing beside the measurements."
         )
-    return Surveyed(moved, found.similarity, frame, tuple(notes), found.fit)
+    return Surveyed(moved, found.similarity, frame, tuple(notes), found.fit, found.names)
+
+
+def check_survey(survey: Survey, names: Sequence[str], sizes: npt.ArrayLike) -> None:
+    """Refuse measurements that no scene of some images can hold, wherever its cameras are.
+
+    Parameters
+    ----------
+    survey : Survey
+        What was measured.
+    names : sequence of N strings
+        The images.
+    sizes : (N, 2) int
+        Their widths and heights, pixels.
+
+    Raises
+    ------
+    InputError
+        If no image has a name of a file, marks lie outside their images, coordinate systems do not fit, or accuracies
+        are missing.
+    """
+    count = len(names)
+    cameras = Cameras.of(np.arange(count) + 1, ["SIMPLE_PINHOLE"] * count, [(1.0, 0.0, 0.0)] * count, sizes)
+    scene = Scene.from_images(cameras, names, np.arange(count), se3.identity(count))
+    notes: list[str] = []
+    _with_places(scene, survey, notes)
+    if survey.poses is not None:
+        pose_table(scene, survey.poses, survey.pose_sigma, notes)
+
+
+def _with_places(scene: Scene, survey: Survey, notes: list[str]) -> tuple[Scene, WorldFrame]:
+    """Return the scene with measured positions and control points, and the frame that these are in."""
+    groups = [group for group in (survey.positions, survey.control and survey.control.places) if group is not None]
+    places, frame = common_frame(groups, survey.crs)
+    for group in groups:
+        notes += group.notes
+    tables: dict[str, Any] = {}
+    if survey.positions is not None:
+        tables["camera_positions"] = position_table(scene, survey, places[0], notes)
+    if survey.control is not None:
+        tables["control_points"], tables["marks"] = control_tables(scene, survey, survey.control, places[-1], notes)
+    return scene.replace(**tables), frame
 
 
 def _without_strays(scene: Scene, agrees: BoolArray) -> Scene:
@@ -135,4 +172,4 @@ def _with_objects(scene: Scene, survey: Survey, notes: list[str]) -> Scene:
     return scene.replace(**tables)
 
 
-__all__ = ["Survey", "Surveyed", "with_survey"]
+__all__ = ["Survey", "Surveyed", "check_survey", "with_survey"]

@@ -37,6 +37,8 @@ class Placing:
     similarity: Similarity
     #: How well places fit; None where none determined the similarity.
     fit: RobustSimilarity | None = None
+    #: Names of these places.
+    names: tuple[str, ...] = ()
 
 
 def placing(before: Scene, scene: Scene, survey: Survey, frame: WorldFrame, notes: list[str]) -> Placing:
@@ -103,7 +105,7 @@ def placing(before: Scene, scene: Scene, survey: Survey, frame: WorldFrame, note
         f"{int(fit.inliers.sum())} of {len(fit.inliers)} measured places, which scatter by {fit.scatter:.3g} a "
         "coordinate."
     )
-    return Placing(fit.similarity, fit)
+    return Placing(fit.similarity, fit, tuple(names))
 
 
 def _correspondences(scene: Scene) -> tuple[FloatArray, FloatArray, Sequence[str]]:

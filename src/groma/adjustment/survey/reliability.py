@@ -7,8 +7,12 @@ Let a measurement of m coordinates have the covariance C, its residual v (comput
 
 .. math:: v_- = (I - \omega S C^{-1})^{-1} v, \qquad S_- = (I - \omega S C^{-1})^{-1} S ,
 
-and at full weight :math:`v_+ = (I + S_- C^{-1})^{-1} v_-` and :math:`Q_v = C - (I + S_- C^{-1})^{-1} S_-`. From the
-last two follow, for each coordinate i, with :math:`P = C^{-1}`,
+and at full weight :math:`v_+ = (I + S_- C^{-1})^{-1} v_-` and :math:`Q_v = C - (I + S_- C^{-1})^{-1} S_-`. A point
+that a single image shows has no place without its coordinates, so the two are computed without that detour:
+
+.. math:: F = (I + (1 - \omega) S C^{-1})^{-1}, \qquad v_+ = F v, \qquad Q_v = C - F S .
+
+From them follow, for each coordinate i, with :math:`P = C^{-1}`,
 
 .. math:: r_i = (Q_v P)_{ii}, \qquad w_i = \frac{(P v_+)_i}{\sqrt{(P Q_v P)_{ii}}}, \qquad
           \nabla_i = \frac{\delta_0}{\sqrt{(P Q_v P)_{ii}}},
@@ -257,13 +261,11 @@ def _tested(frame: _Frame, kind: str, rows: IntArray, factor: Factor, takes_part
     weight = weight * takes_part
     spread = _spread(frame, factor)
     eye = np.eye(residual.shape[1])
-    without = np.linalg.pinv(eye - weight[:, None, None] * spread @ information, rcond=1e-12)
-    alone, spread_alone = np.einsum("nij,nj->ni", without, residual), without @ spread
-    full = np.linalg.inv(eye + spread_alone @ information)
-    cofactor = np.linalg.inv(information) - full @ spread_alone
+    full = np.linalg.inv(eye + (1.0 - weight)[:, None, None] * spread @ information)
+    cofactor = np.linalg.inv(information) - full @ spread
     shares = np.clip(np.einsum("nij,nji->ni", cofactor, information), 0.0, 1.0)
     return _Test(
-        kind, rows, takes_part, residual, np.einsum("nij,nj->ni", full, alone), information, cofactor, shares, weight
+        kind, rows, takes_part, residual, np.einsum("nij,nj->ni", full, residual), information, cofactor, shares, weight
     )
 
 

@@ -88,7 +88,7 @@ def _check_inside(scene: Scene, source: str, image: IntArray, pixels: FloatArray
         row = int(np.argmax(outside))
         name, (width, height) = scene.images.names[image[row]], size[row]
         raise InputError(
-            f"{source}: {counted(int(outside.sum()), 'marks')} lie outside their images, such as "
+            f"{source}: {counted(int(outside.sum()), 'marks')} outside of their images, such as "
             f"({pixels[row, 0]:.0f}, {pixels[row, 1]:.0f}) in {name} of {width} x {height} pixels. Were they made in "
             "images of another size?"
         )

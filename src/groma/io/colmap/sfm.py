@@ -38,6 +38,8 @@ from groma.scene import Scene
 _ROOM, _IMAGE_ROOM, _PAIR_ROOM = 8 << 20, 4 << 20, 1 << 18
 #: Matches per image from which a failure is not one of overlap or texture (convention: a word in a message).
 FEW_MATCHES = 100
+#: Field of view of a fisheye of unknown focal length, radians over the diagonal (convention: full-frame fisheyes).
+_FISHEYE_VIEW = math.pi
 #: Images that a model needs.
 _LEAST_IMAGES = 3
 
@@ -153,6 +155,7 @@ def reconstruct_points(
         folder.mkdir(parents=True, exist_ok=True)
         _check_room(folder)
         _enter_images(pycolmap, database, Path(images), names, options)
+        _expect_fisheyes(pycolmap, database)
         _find_features(pycolmap, database, Path(images), names, options, say)
         with _opened(pycolmap, database) as content:
             ordered = by_frames(options.rigs, names)
@@ -246,6 +249,20 @@ def _enter_images(pycolmap: Any, database: Path, images: Path, names: list[str],
             reader.camera_model, params = mounted.camera_model, mounted.camera_params
         reader.camera_params = "" if params is None else ",".join(repr(float(value)) for value in params)
         pycolmap.import_images(database, images, pycolmap.CameraMode.SINGLE, members, reader)
+
+
+def _expect_fisheyes(pycolmap: Any, database: Path) -> None:
+    """Give fisheyes of unknown focal length the one that spans :data:`_FISHEYE_VIEW` over the diagonal.
+
+    Without calibration pycolmap relates two images by a fundamental matrix, which fisheyes lack, and finds no pair.
+    """
+    with _opened(pycolmap, database) as content:
+        for camera in content.read_all_cameras():
+            if camera.is_perspective_fisheye() and not camera.has_prior_focal_length:
+                params = camera.params
+                params[camera.focal_length_idxs()] = math.hypot(camera.width, camera.height) / _FISHEYE_VIEW
+                camera.params, camera.has_prior_focal_length = params, True
+                content.update_camera(camera)
 
 
 def _find_features(

@@ -281,17 +281,17 @@ def _plane_table(scene: Scene, after: Drawable) -> str:
 
 
 def _relation_table(scene: Scene, outcomes: Mapping[str, Mapping[str, int]]) -> str:
-    """Return a table of the relations by kind, with the numbers kept and rejected by the adjustment."""
+    """Return a table of the relations by kind, with the numbers rejected by the adjustment."""
     there = num_relations(scene)
-    became = {kind: [f"{outcome['held']:,}", f"{outcome['dropped']:,}"] for kind, outcome in outcomes.items()}
+    rejected = {kind: f"{outcome['dropped']:,}" for kind, outcome in outcomes.items()}
     rows = [
-        [kind.replace("_", " "), f"{there.get(kind, 0):,}", *became.get(kind, ["", ""])]
+        [kind.replace("_", " "), f"{there.get(kind, 0):,}", rejected.get(kind, "")]
         for kind in scene.relations.kinds()
-        if kind in there or kind in became
+        if kind in there or kind in rejected
     ]
-    caption = "Structural relations: how many there are, and how many of them the last adjustment "
-    caption += "kept and rejected. Rejected ones are no longer in the scene; lines that meet are held on request."
-    return table("Relations", caption, ["", "number", "kept", "rejected"], rows) if rows else ""
+    caption = "Structural relations: how many are in the scene, and how many more the last adjustment rejected. Lines "
+    caption += "that meet are held on request."
+    return table("Relations", caption, ["", "number", "rejected"], rows) if rows else ""
 
 
 def _direction_table(scene: Scene) -> str:
