@@ -321,7 +321,7 @@ class Scores:
 
     def __init__(self, features: Features, planes: FloatArray, homes: IntArray, gate: float, reach: float) -> None:
         self._features, self._planes, self._homes = features, planes, homes
-        self._gate, self._reach = gate, reach
+        self._gate, self._reach, self.count = gate, reach, len(planes)
         self._rooms: list[_Room] = []
         self._at = np.argsort(homes, kind="stable")
         self._first_at = np.searchsorted(homes[self._at], np.arange(len(features.places) + 1))
