@@ -140,7 +140,9 @@ def find_planes(
     partner[len(points) :] = len(points) + (np.arange(2 * len(ends)) ^ 1)
     labels = np.full(len(places), -1)
     say = progress or (lambda done, total: None)
-    found = _extract(places, noise, partner, carrier, len(points), labels, options, say) if len(places) >= 4 else []
+    found: list[Grown] = []
+    if len(places) >= max(options.min_support, 4):
+        found = _extract(places, noise, partner, carrier, len(points), labels, options, say)
     fits = [grown.fit for grown in found]
     end_label = labels[len(points) :].reshape(-1, 2)
     return PlaneSet(
@@ -169,9 +171,10 @@ def _extract(
     """Find planes, then rough ones; ``filled`` gets their numbers."""
     features, labels = features_of(places, noise, partner, carrier), np.full(len(places), -1)
     found: list[Grown] = []
-    for one in (features, features.thicker(PLANE_SEARCH.thicker)):
-        if np.count_nonzero(labels < 0) >= options.min_support:
-            _extract_of(one, num_points, labels, found, options, progress)
+    rough = begin(partial(features.thicker, PLANE_SEARCH.thicker))
+    _extract_of(features, num_points, labels, found, options, progress)
+    if np.count_nonzero(labels < 0) >= options.min_support:
+        _extract_of(rough(), num_points, labels, found, options, progress)
     filled[features.given] = labels
     return found
 
