@@ -7,7 +7,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from groma.estimators._plane_candidates import features_of
+from groma.estimators._plane_candidates import features_of, keep_others_loop
 from groma.estimators._plane_growth import tilt_loop
 from groma.estimators._plane_loops import connected_loop, connected_part_loop, fit_loop
 from groma.estimators.plane_fit import fit_plane, tilt_sigma
@@ -123,3 +123,21 @@ def test_connected_is_what_is_near_in_the_projection():
     assert (connected == (distance <= 1.5 * reach[which])).all()
     connected_loop(support, rows[:0], tested, which, reach, 1.5, plane, connected)
     assert not connected.any()
+
+
+@pytest.mark.parametrize("number", [1, 2, 7, 8])
+def test_candidates_near_a_plane_are_dropped_by_the_median_of_their_distances(number):
+    """Also where as many features are within the limit as beyond it, so that the two in the middle tell."""
+    rng = np.random.default_rng(number)
+    features = features_at(rng.normal(size=(number, 3)))
+    planes = np.column_stack([np.tile([0.0, 0.0, 1.0], (400, 1)), rng.uniform(-2.0, 2.0, 400)])
+    alive, mark = rng.random(400) < 0.9, np.full(number, -1)
+    limit = 800.0 * 1e-3  # in standard deviations of the features
+    away = np.median(np.abs(features.places[:, 2] + planes[:, 3:]), axis=1)
+    expected = alive & (away > limit)
+    first_at = np.append(0, np.full(number, 400))  # all candidates are at home at the first feature
+    keep_others_loop(
+        features.arrays, np.arange(number), planes[0], planes, 800.0, first_at, np.arange(400), mark, alive
+    )
+    assert (alive == expected).all() and 0 < alive.sum() < 360
+    assert (mark == -1).all()

@@ -20,16 +20,16 @@ from groma._trees import kd_tree, nearest
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators._plane_loops import BALL, height_kernel, least_axis_kernel, lies_on_kernel, variance_kernel
 from groma.estimators._plane_options import PLANE_SEARCH
-from groma.execution import map_in_threads
+from groma.execution import map_in_threads, map_ranges
 from groma.geometry.algebra import cross, dot, norm
 
 #: Pairs processed together (cost: memory).
 _CHUNK = 4096
 #: Features, or up to twice as many, by which two planes are compared (cost: time only).
 _JUDGES = 64
-#: Candidates that are worth a thread: one takes a hundredth of a millisecond, and handing over a tenth. And pieces, as
-#: some candidates take longer than others (cost: time only).
-_SCORED_AT_ONCE, _PIECES = 256, 32
+#: Candidates that are worth a thread, to be drawn and to be scored: scoring one takes a hundredth of a millisecond, and
+#: handing over a tenth. And pieces, as some candidates take longer than others (cost: time only).
+_DRAWN_AT_ONCE, _SCORED_AT_ONCE, _PIECES = 1024, 256, 32
 
 
 #: Where the entries of a covariance, and those of its diagonal, are among the packed ones.
@@ -168,10 +168,14 @@ def from_neighbours(
     seed = free[rng.permutation(np.repeat(np.arange(number), -(-count // number)))[:count]]
     choice = rng.integers(1, near, (count, 2))
     planes = np.empty((count, 4))
-    _through_neighbours(
-        features.places, features.packed, features.neighbours, seed, choice, PLANE_SEARCH.wider * gate,
-        PLANE_SEARCH.rounds, planes
-    )  # fmt: skip
+
+    def draw(part: slice) -> None:
+        _through_neighbours(
+            features.places, features.packed, features.neighbours, seed[part], choice[part], PLANE_SEARCH.wider * gate,
+            PLANE_SEARCH.rounds, planes[part]
+        )  # fmt: skip
+
+    map_ranges(draw, count, _DRAWN_AT_ONCE)
     valid = planes[:, :3].any(axis=1)
     return planes[valid], seed[valid]
 
@@ -313,10 +317,16 @@ def keep_others_loop(features, rows, plane, planes, same, first_at, at, mark, al
                 continue
             mark[i] = 0
             for c in range(first_at[i], first_at[i + 1]):
-                if alive[at[c]]:
-                    for j in range(len(height)):
-                        height[j] = abs(height_kernel(places[rows[j * step]], planes[at[c]]))
-                    alive[at[c]] = median(height) > limit
+                within = beyond = 0
+                while alive[at[c]] and within + beyond < len(height) and 2 * max(within, beyond) <= len(height):
+                    j = within + beyond
+                    height[j] = abs(height_kernel(places[rows[j * step]], planes[at[c]]))
+                    if height[j] > limit:
+                        beyond += 1
+                    else:
+                        within += 1
+                if within > beyond or (within == beyond > 0 and median(height) <= limit):
+                    alive[at[c]] = False
     for k in range(len(rows)):
         for m in range(neighbours.shape[1]):
             mark[neighbours[rows[k], m]] = -1
@@ -341,7 +351,7 @@ class Scores:
 
     def __init__(self, features: Features, planes: FloatArray, homes: IntArray, gate: float, reach: float) -> None:
         self._features, self._planes, self._homes = features, planes, homes
-        self._gate, self._reach = gate, reach
+        self._gate, self._reach, self.count = gate, reach, len(planes)
         self._rooms: list[_Room] = []
         self._at = np.argsort(homes, kind="stable")
         self._first_at = np.searchsorted(homes[self._at], np.arange(len(features.places) + 1))

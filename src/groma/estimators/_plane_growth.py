@@ -179,8 +179,20 @@ class Grown:
     taken: IntArray
 
 
+#: A plane if it is kept; the refined plane, and its support.
+Growth = tuple[Grown | None, FloatArray, IntArray]
+
+
+class _Buffers:
+    """What one thread writes to while it grows a candidate."""
+
+    def __init__(self, count: int) -> None:
+        self.mark, self.room = np.full(count, -1), np.empty((4, count), np.int64)
+        self.joined, self.numbers = np.empty(count, bool), np.empty((5, count))
+
+
 class Grower:
-    """Grows candidates on the same features; reuses its buffers.
+    """Grows candidates on the same features, several threads at a time; reuses its buffers.
 
     Parameters
     ----------
@@ -197,9 +209,7 @@ class Grower:
     def __init__(self, features: Features, gate: float, log_tried: float, options: PlaneOptions) -> None:
         self._features = features
         self._gate, self._log_tried, self._options = gate, log_tried, options
-        count = len(features.places)
-        self._mark, self._room = np.full(count, -1), np.empty((4, count), np.int64)
-        self._joined, self._numbers = np.empty(count, bool), np.empty((5, count))
+        self._free: list[_Buffers] = []
         self._refining = (
             gate, GATES.wider, GATES.far, GATES.link, GATES.converged, GATES.band, options.min_support,
             options.max_tilt, features.rough, GATES.rank, GATES.grow_steps, GATES.fit_rounds,
@@ -207,51 +217,53 @@ class Grower:
         least = GATES.hopeless * options.min_share
         self._polishing = GATES.link, GATES.inlier, least, ROUNDS, GATES.polish_steps, GATES.fit_rounds
 
-    def grow(self, plane: FloatArray, home: int, labels: IntArray) -> tuple[Grown | None, FloatArray, IntArray]:
+    def grow(self, plane: FloatArray, home: int, labels: IntArray) -> Growth:
         """Refine a candidate where it is connected, and test it: its rows, the refined plane, its support.
 
         It grows from the neighbourhood of its ``home``, a feature: what lies on the same plane far away is another's.
         """
-        features, options, plane, center = self._features, self._options, plane.copy(), np.empty(3)
+        try:
+            buffers = self._free.pop()  # exclusive until they are put back
+        except IndexError:
+            buffers = _Buffers(len(self._features.places))
+        result = self._grown(plane.copy(), home, labels, buffers)
+        self._free.append(buffers)
+        return result
+
+    def _grown(self, plane: FloatArray, home: int, labels: IntArray, buffers: _Buffers) -> Growth:
+        features, options, center = self._features, self._options, np.empty(3)
         first = features.neighbours[home]
-        self._room[2, : len(first)] = first
+        buffers.room[2, : len(first)] = first
         count, band, inner, share = _grow_loop(
-            features.arrays, labels, self._refining, self._polishing, self._mark, self._room, self._joined,
-            self._numbers, plane, center,
+            features.arrays, labels, self._refining, self._polishing, buffers.mark, buffers.room, buffers.joined,
+            buffers.numbers, plane, center,
         )  # fmt: skip
-        rows, layer = self._room[2, :count].copy(), self._room[3, :inner]
+        rows, layer = buffers.room[2, :count].copy(), buffers.room[3, :inner]
         if inner == 0 or share < options.min_share:
             return None, plane, rows
-        edges = self._edges(layer[self._on(inner)], labels)
-        alarm, even = self._log10_false_alarms(plane, np.concatenate([rows, edges])), self._log10_even(inner, band)
+        height, spread, precision, weight = buffers.numbers[:4, :inner]
+        reach = math.sqrt(self._gate) * spread
+        edges = self._edges(layer[np.abs(height) < reach], labels)
+        alarm = self._log10_false_alarms(plane, np.concatenate([rows, edges]), buffers.mark)
+        even = _log10_even(height, reach, band)
         if features.rough:  # some thicker layer stands out by chance
             even += self._log_tried
         if max(alarm, even) > np.log10(options.max_false_alarms):
             return None, plane, rows
-        if features.rough and np.mean(labels[layer[self._on(inner)]] < 0) <= GATES.own:
+        if features.rough and np.mean(labels[layer[np.abs(height) < reach]] < 0) <= GATES.own:
             return None, plane, rows
-        precision, weight = self._numbers[2, :inner], self._numbers[3, :inner]
         fit = fit_with_covariance(plane, center, features.places[layer], precision, weight)
         # The whole layer is taken out: relief so near cannot be distinguished from the plane.
         taken = np.union1d(rows, layer[labels[layer] < 0])
         return Grown(fit, share, band, alarm, features.places[rows], taken), plane, rows
 
-    def _log10_false_alarms(self, plane: FloatArray, rows: IntArray) -> float:
+    def _log10_false_alarms(self, plane: FloatArray, rows: IntArray, mark: IntArray) -> float:
         """Number of planes tried on which as much would lie by chance, of what is in a ball around it, log10."""
         features, places = self._features, self._features.places
         center = places[rows].mean(axis=0)
         radius = float(np.quantile(norm(places[rows] - center), GATES.extent))
         inside, number, chance = ball_loop(
-            places,
-            features.packed,
-            features.carrier,
-            features.balls,
-            rows,
-            center,
-            radius,
-            plane,
-            self._gate,
-            self._mark,
+            places, features.packed, features.carrier, features.balls, rows, center, radius, plane, self._gate, mark
         )
         return log10_binomial_tail(inside - 4, number - 3, chance / max(number, 1)) + self._log_tried  # three fix it
 
@@ -260,23 +272,19 @@ class Grower:
         other = self._features.partner[on]
         return on[(labels[on] >= 0) & (other != on) & np.isin(other, on)]
 
-    def _on(self, inner: int) -> BoolArray:
-        """Which of the last layer lie on the plane."""
-        return np.abs(self._numbers[0, :inner]) < math.sqrt(self._gate) * self._numbers[1, :inner]
 
-    def _log10_even(self, inner: int, band: float) -> float:
-        """How likely so much of the last layer lies on the plane if it is filled as its fuller side is, log10.
+def _log10_even(height: FloatArray, reach: FloatArray, band: float) -> float:
+    """How likely so much of a layer lies within ``reach`` of the plane if it is filled as its fuller side is, log10.
 
-        A round body fills one side of the layer of a plane that touches it, and the sides of a thin post both sides of
-        the layer of any plane that cuts through them.
-        """
-        height, reach = self._numbers[0, :inner], math.sqrt(self._gate) * self._numbers[1, :inner]
-        above, below = height >= reach, height <= -reach
-        fuller = above if np.count_nonzero(above) > np.count_nonzero(below) else below
-        on = ~(above | below)
-        counted = reach[on | fuller]
-        chance = float(np.minimum(2.0 * counted / (counted + band), 1.0).mean())
-        return log10_binomial_tail(int(np.count_nonzero(on)) - 4, len(counted) - 3, chance)  # three fix it
+    A round body fills one side of the layer of a plane that touches it, and the sides of a thin post both sides of
+    the layer of any plane that cuts through them.
+    """
+    above, below = height >= reach, height <= -reach
+    fuller = above if np.count_nonzero(above) > np.count_nonzero(below) else below
+    on = ~(above | below)
+    counted = reach[on | fuller]
+    chance = float(np.minimum(2.0 * counted / (counted + band), 1.0).mean())
+    return log10_binomial_tail(int(np.count_nonzero(on)) - 4, len(counted) - 3, chance)  # three fix it
 
 
 def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, plane: FloatArray) -> BoolArray:

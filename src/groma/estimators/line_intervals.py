@@ -21,10 +21,13 @@ from groma._numba import kernel, loop
 from groma._ordering import ascending, median, sort_by
 from groma._typing import FloatArray, IntArray
 from groma.estimators.line_ends import LINE_ENDS
+from groma.execution import map_ranges
 from groma.gates import numbers
 
 #: Images that must show a place of a line.
 _MIN_IMAGES = 2
+#: Lines that are worth a thread: some milliseconds (cost: time only).
+_LINES_AT_ONCE = 512
 
 
 @kernel
@@ -137,8 +140,13 @@ def supported_intervals(
     pointers = np.searchsorted(line_idx[order], np.arange(num_lines + 1))
     begins, ends = np.zeros(len(order)), np.zeros(len(order))
     count = np.zeros(num_lines, np.int64)
-    columns = (np.ascontiguousarray(column[order], np.float64) for column in (share[:, 0], share[:, 1], size))
-    _all_intervals(pointers, np.ascontiguousarray(image_idx[order]), *columns, numbers(LINE_ENDS), begins, ends, count)
+    columns = [np.ascontiguousarray(column[order], np.float64) for column in (share[:, 0], share[:, 1], size)]
+    image, gates = np.ascontiguousarray(image_idx[order]), numbers(LINE_ENDS)
+
+    def fill(part: slice) -> None:
+        _all_intervals(pointers[part.start : part.stop + 1], image, *columns, gates, begins, ends, count[part])
+
+    map_ranges(fill, num_lines, _LINES_AT_ONCE)
     line = np.repeat(np.arange(num_lines), count)
     row = pointers[line] + np.arange(len(line)) - np.repeat(np.cumsum(count) - count, count)
     return line, np.column_stack([begins[row], ends[row]])

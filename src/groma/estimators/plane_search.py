@@ -33,7 +33,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from heapq import heapify, heappop, heappush
+from functools import partial
+from heapq import heappop, heappush
 
 import numpy as np
 
@@ -47,8 +48,9 @@ from groma.estimators._plane_candidates import (
     from_planes,
     from_segments,
 )
-from groma.estimators._plane_growth import Grower, Grown, connected_to
+from groma.estimators._plane_growth import Grower, Grown, Growth, connected_to
 from groma.estimators._plane_options import PLANE_SEARCH, PlaneOptions
+from groma.execution import begin
 from groma.gates import chi_square_gate
 from groma.geometry.algebra import vectors
 
@@ -56,6 +58,8 @@ from groma.geometry.algebra import vectors
 BAND = PLANE_SEARCH.band
 #: Candidates whose scores are brought up to date together (cost: time only).
 _SCORED_TOGETHER = 16
+#: Failures in a row from which on the next candidate is grown ahead, as it will probably be needed (cost: time only).
+_AHEAD = 2
 
 
 @dataclass(frozen=True)
@@ -148,7 +152,9 @@ def find_planes(
     partner[len(points) :] = len(points) + (np.arange(2 * len(ends)) ^ 1)
     labels = np.full(len(places), -1)
     say = progress or (lambda done, total: None)
-    found = _extract(places, noise, partner, carrier, len(points), labels, options, say) if len(places) >= 4 else []
+    found: list[Grown] = []
+    if len(places) >= max(options.min_support, 4):
+        found = _extract(places, noise, partner, carrier, len(points), labels, options, say)
     fits = [grown.fit for grown in found]
     end_label = labels[len(points) :].reshape(-1, 2)
     return PlaneSet(
@@ -182,9 +188,11 @@ def _extract(
     def say(done: int, total: int) -> None:
         progress(settled + done, settled + total)
 
-    for one in (features, features.thicker(PLANE_SEARCH.thicker)):
+    rough = begin(partial(features.thicker, PLANE_SEARCH.thicker))
+    for searched in (lambda: features, rough):
         if np.count_nonzero(labels < 0) < options.min_support:
             break  # too few are left
+        one = searched()
         rng, number = np.random.default_rng(options.seed), -1
         free, corner = one.position[labels[one.position] < 0], one.position[num_points:].reshape(-1, 2)
         first, first_homes = from_neighbours(one, free, gate, rng)
@@ -214,43 +222,71 @@ def _extract_of(
 ) -> None:
     """Find planes one by one, beside those ``found``; ``labels`` and ``found`` are added to."""
     gate = chi_square_gate(1.0 - options.level, 1)
-    scores = Scores(features, candidates, homes, gate, PLANE_SEARCH.link)
-    support, score = scores.of(np.arange(len(candidates)), labels)
-    log_tried = np.log10(2.0 * PLANE_SEARCH.refined * num_tried + 1.0)  # two thicknesses
+    log_tried = float(np.log10(2.0 * PLANE_SEARCH.refined * num_tried + 1.0))  # two thicknesses
     # With less information than the test of false alarms needs, a candidate will be rejected.
-    least_score = np.log(10.0) * (log_tried - np.log10(options.max_false_alarms))
-    alive = (support >= 0.5 * options.min_support) & (score >= least_score)
-    queue = [(-float(score[k]), int(k)) for k in np.flatnonzero(alive)]
-    heapify(queue)
-    grower = Grower(features, gate, float(log_tried), options)
-    failures, scored = 0, np.full(len(candidates), len(found))
-    patience = max(PLANE_SEARCH.patience, len(candidates) // PLANE_SEARCH.candidates_per_failure)
-    while queue and failures < patience:
-        _, best = heappop(queue)
-        if not alive[best]:
-            continue
-        # Scores only fall while planes are taken out: the best is the best if its own is of after the last one.
+    least_score = float(np.log(10.0) * (log_tried - np.log10(options.max_false_alarms)))
+    scores = Scores(features, candidates, homes, gate, PLANE_SEARCH.link)
+    queue = _Queue(scores, labels, 0.5 * options.min_support, least_score)
+    grower = Grower(features, gate, log_tried, options)
+    failures, patience = 0, max(PLANE_SEARCH.patience, len(candidates) // PLANE_SEARCH.candidates_per_failure)
+    ahead: dict[int, Callable[[], Growth]] = {}
+    while failures < patience and (best := queue.best()) is not None:
         progress(len(candidates) - len(queue), len(candidates))
-        if scored[best] < len(found):
-            stale = [best]
-            while queue and len(stale) < _SCORED_TOGETHER and scored[queue[0][1]] < len(found):
-                _, other = heappop(queue)
-                if alive[other]:
-                    stale.append(other)
-            support, score = scores.of(np.array(stale), labels)
-            scored[stale] = len(found)
-            hopeful = (support >= 0.5 * options.min_support) & (score >= least_score)
-            for k in np.flatnonzero(hopeful):
-                heappush(queue, (-float(score[k]), stale[k]))
-            continue
-        alive[best] = False
+        queue.alive[best] = False
+        grow = ahead.pop(best, partial(grower.grow, candidates[best], int(homes[best]), labels))
+        ahead.clear()
+        if failures >= _AHEAD and (other := queue.best(stays=True)) is not None:
+            ahead[other] = begin(partial(grower.grow, candidates[other], int(homes[other]), labels))
+        grown, plane, rows = grow()
         failures += 1
-        grown, plane, rows = grower.grow(candidates[best], int(homes[best]), labels)
         if grown is not None:
             failures = 0
             labels[grown.taken] = len(found)
             found.append(grown)
-        scores.keep_others(plane, rows, alive)
+            queue.labels_changed()
+            ahead.clear()
+        scores.keep_others(plane, rows, queue.alive)
+
+
+class _Queue:
+    """Candidates, the best first, that have enough support and information among features without a label."""
+
+    def __init__(self, scores: Scores, labels: IntArray, least_support: float, least_score: float) -> None:
+        self._scores, self._labels, self._least = scores, labels, (least_support, least_score)
+        #: (H,) which are worth a try, and whether their scores are of these labels.
+        self.alive, self._fresh = np.ones(scores.count, bool), np.zeros(scores.count, bool)
+        self._queue: list[tuple[float, int]] = []
+        self._put(np.arange(scores.count))
+
+    def __len__(self) -> int:
+        return len(self._queue)
+
+    def labels_changed(self) -> None:
+        """Note that no score is of these labels any more."""
+        self._fresh[:] = False
+
+    def best(self, stays: bool = False) -> int | None:
+        """Return the best candidate, None if there is none, and take it off unless it ``stays``."""
+        queue = self._queue
+        while queue:
+            # Scores only fall while planes are taken out: the best is the best if its own is of after the last one.
+            stale: list[int] = []
+            while queue and len(stale) < _SCORED_TOGETHER and not (self.alive[k := queue[0][1]] and self._fresh[k]):
+                heappop(queue)
+                if self.alive[k]:
+                    stale.append(k)
+            if not stale:
+                return (queue[0] if stays else heappop(queue))[1] if queue else None
+            self._put(np.array(stale, np.int64))
+        return None
+
+    def _put(self, which: IntArray) -> None:
+        """Score some candidates, and put those on the queue that are still worth a try."""
+        support, score = self._scores.of(which, self._labels)
+        self._fresh[which] = True
+        self.alive[which] = (support >= self._least[0]) & (score >= self._least[1])
+        for k in np.flatnonzero(self.alive[which]).tolist():
+            heappush(self._queue, (-float(score[k]), int(which[k])))
 
 
 __all__ = ["BAND", "PlaneOptions", "PlaneSet", "connected_to", "find_planes"]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.cameras import model as camera_model
 from groma.errors import InputError
+from groma.execution import map_in_threads
 from groma.features.sift import describe_upright
 from groma.gates import gate
 from groma.geometry import quaternion
@@ -63,17 +65,9 @@ def check_points_shown(scene: Scene, files: Sequence[Path], gates: ShownGates = 
     InputError
         If most pairs that were looked at do not.
     """
-    pairs: list[tuple[float, str]] = []
     count = np.bincount(scene.point_observations.image_idx, minlength=scene.num_images)
-    for image in np.argsort(-count, kind="stable")[: gates.pairs].tolist():
-        other, pixels = _shared(scene, image, gates)
-        first, second = (_described(files[i], own, gates.size) for i, own in zip((image, other), pixels, strict=True))
-        shown = first.any(axis=1) & second.any(axis=1)
-        if shown.sum() < gates.least:
-            continue
-        alike = first[shown] @ second[shown].T
-        share = float((np.diag(alike)[:, None] > alike).sum()) / (len(alike) * (len(alike) - 1))
-        pairs.append((share, f"{files[image]} and {files[other].name}"))
+    most = np.argsort(-count, kind="stable")[: gates.pairs].tolist()
+    pairs = [pair for pair in map_in_threads(partial(_compared, scene, files, gates), most) if pair is not None]
     middle = sorted(pairs)[len(pairs) // 2] if pairs else (1.0, "")
     if middle[0] < gates.alike:
         raise InputError(
@@ -82,6 +76,18 @@ def check_points_shown(scene: Scene, files: Sequence[Path], gates: ShownGates = 
             "about 50 %). Photographs of another scene may have the same names: pass those that the model was made "
             "from."
         )
+
+
+def _compared(scene: Scene, files: Sequence[Path], gates: ShownGates, image: int) -> tuple[float, str] | None:
+    """How alike a photograph and another are where both see a point, and their names; None if these points are few."""
+    other, pixels = _shared(scene, image, gates)
+    first, second = (_described(files[i], own, gates.size) for i, own in zip((image, other), pixels, strict=True))
+    shown = first.any(axis=1) & second.any(axis=1)
+    if shown.sum() < gates.least:
+        return None
+    alike = first[shown] @ second[shown].T
+    share = float((np.diag(alike)[:, None] > alike).sum()) / (len(alike) * (len(alike) - 1))
+    return share, f"{files[image]} and {files[other].name}"
 
 
 def _shared(scene: Scene, image: int, gates: ShownGates) -> tuple[int, list[FloatArray]]:

@@ -51,7 +51,8 @@ class Workers:
 
 
 #: Problems with fewer factors are one share: they are not worth a thread; nor is a share of less than half of it. Where
-#: nothing is summed but costs, because nothing stays in a reduced system, fewer are (cost: time only).
+#: nothing is summed but costs, because nothing stays in a reduced system, fewer are; shares have twice as many, as they
+#: are quick, and threads wait for the interpreter after each of their twenty loops (cost: time only).
 FACTORS_FOR_THREADS, FACTORS_ALONE = 50_000, 10_000
 #: Fewer factors are not worth waking another thread for: some 2 milliseconds of one thread, of which the other saves
 #: half, where waking it takes a tenth and it may have to wait for a core. A cost takes a third of a linearisation
@@ -78,7 +79,7 @@ def num_shares(layout: Layout) -> int:
         uses += sum(len(seen.pair_slots) for seen in group.incidences.values())
         uses += sum(len(slots) for slots, _ in group.cross.values())
     count = min(MAX_SHARES, MAX_BYTES * size // max(8 * numbers, 1), len(layout.chunks) // 2)
-    count = min(count, 2 * size // max(least, 1))
+    count = min(count, size // max(least // 2 if layout.kept else 2 * least, 1))
     if layout.eliminated:
         count = min(count, uses // max(USES_OF_A_BLOCK * blocks, 1)) if blocks else count
     return max(2, count)

@@ -158,6 +158,6 @@ def is_certain(tracks: Tracks, options: MapLinesOptions) -> BoolArray:
 def _distance(tracks: Tracks) -> FloatArray:
     """(L,) mean distance of the lines' middles from the cameras that see them."""
     views, (rows, line) = tracks.views, tracks.members()
-    away = np.linalg.norm(tracks.lines[line].mean(1) - views.center[views.image_idx[rows]], axis=1)
+    away = np.linalg.norm(tracks.lines.mean(1)[line] - views.center[views.image_idx[rows]], axis=1)
     number = np.bincount(line, minlength=tracks.num_lines)
     return np.bincount(line, away, minlength=tracks.num_lines) / np.maximum(number, 1)
