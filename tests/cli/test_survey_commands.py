@@ -152,7 +152,7 @@ def test_what_does_not_fit_is_one_line(folder, tmp_path, capsys, monkeypatch, op
     ("options", "scale", "words"),
     [
         ("--control {folder}/gcp_list.txt", 1, "--control-sigma 0.02"),
-        ("--control {folder}/gcp_list.txt --control-sigma 0.02", 2, "outside of their images"),
+        ("--control {folder}/gcp_list.txt --control-sigma 0.02", 2, "marks lie outside their images"),
         ("--control {folder}/gcp_list.txt --control-sigma 0.02 --check q1", 1, "no control point"),
         ("--positions {folder}/positions.txt --position-sigma 1 --crs utm", 1, "does not say its coordinate"),
     ],

@@ -280,7 +280,7 @@ def test_what_the_data_determine(tmp_path):
     assert text.index("is-problem") < text.index('class="is-note"')
     numbers = REPORT.to_dict() | {
         "history": [], "termination_sentence": "", "diagnosis": found,
-        "relations": {"point_on_plane": {"held": 5678, "dropped": 12}},
+        "relations": {"point_on_plane": {"held": 12, "dropped": 5678}},
     }  # fmt: skip
     (tmp_path / "summary.json").write_text(json.dumps(numbers))
     text = write_page(tmp_path, None, exact_scene(), saved_report(tmp_path))

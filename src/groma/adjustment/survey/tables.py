@@ -87,8 +87,9 @@ def _check_inside(scene: Scene, source: str, image: IntArray, pixels: FloatArray
     if outside.any():
         row = int(np.argmax(outside))
         name, (width, height) = scene.images.names[image[row]], size[row]
+        many = int(outside.sum())
         raise InputError(
-            f"{source}: {counted(int(outside.sum()), 'marks')} outside of their images, such as "
+            f"{source}: {counted(many, 'marks')} {'lies' if many == 1 else 'lie'} outside their images, such as "
             f"({pixels[row, 0]:.0f}, {pixels[row, 1]:.0f}) in {name} of {width} x {height} pixels. Were they made in "
             "images of another size?"
         )

@@ -27,6 +27,7 @@ Reference: the documentation of OpenSfM, *Geometric models* and *Reconstruction 
 from __future__ import annotations
 
 import os
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -72,14 +73,23 @@ class OpenSfmReconstruction:
 
 
 def read_opensfm(path: str | os.PathLike[str]) -> Scene:
-    """Read a ``reconstruction.json``; of several reconstructions the one with most images.
+    """Read a ``reconstruction.json``; of several reconstructions the one with most images, with a warning.
 
     Raises
     ------
     FileFormatError
         If the file is damaged, or a kind of camera is not known.
     """
-    return max(read_opensfm_reconstructions(path), key=lambda one: one.scene.num_images).scene
+    scenes = [one.scene for one in read_opensfm_reconstructions(path)]
+    scenes.sort(key=lambda scene: -scene.num_images)
+    if len(scenes) > 1:
+        sizes = [f"{scene.num_images:,}" for scene in scenes]
+        warnings.warn(
+            f"{path} holds {len(scenes)} reconstructions in frames of their own. The one with most images "
+            f"({sizes[0]}) is read, the others ({', '.join(sizes[1:])} images) are not.",
+            stacklevel=2,
+        )
+    return scenes[0]
 
 
 def read_opensfm_reconstructions(path: str | os.PathLike[str]) -> tuple[OpenSfmReconstruction, ...]:
