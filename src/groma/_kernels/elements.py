@@ -53,7 +53,7 @@ def _item(value: Any, place: int) -> Any:
 
 def _is_view(array: Any, kinds: Any, found: Any) -> bool:
     """Whether what is found is what is left of an array by its first indices."""
-    return kinds is not None and type(found) is types.Array and found.ndim == array.ndim - len(kinds)
+    return type(found) is types.Array and found.ndim == array.ndim - len(kinds)
 
 
 @cache
@@ -100,7 +100,8 @@ class _Lower(Lower):
         index = value.index if value.op == "getitem" else value.index_var
         array = self.typeof(value.value.name)
         found = getattr(self.fndesc.calltypes.get(value), "return_type", None)  # tuples have none
-        return index is not None and _is_view(array, self._kinds(array, index), found)
+        kinds = None if index is None else self._kinds(array, index)
+        return kinds is not None and _is_view(array, kinds, found)
 
     def _is_counted_type(self, name: str) -> bool:
         return self._is_counted(self.typeof(name))
@@ -228,7 +229,7 @@ class _Lower(Lower):
         """Read one number, or name a part of an array by its first indices."""
         array = self.typeof(value.name)
         kinds, found = self._kinds(array, index), signature.return_type
-        if _is_view(array, kinds, found):
+        if kinds is not None and _is_view(array, kinds, found):
             part = self._view(value.name, array, index.name, kinds)
             self.incref(found, part)
             return self.context.cast(self.builder, part, found, resty)

@@ -45,7 +45,7 @@ class InlineClosureLikes(NumbaInlineClosureLikes):
 
     _name = "groma_inline_closure_likes"
 
-    def run_pass(self, state: Any) -> bool:
+    def run_pass(self, state: Any) -> Any:
         """Inline functions that are defined inside."""
         return any(_is_inlined(found.value) for found in _assignments(state)) and super().run_pass(state)
 
@@ -68,6 +68,6 @@ class NopythonRewrites(NumbaRewrites):
 
     _name = "groma_nopython_rewrites"
 
-    def run_pass(self, state: Any) -> bool:
+    def run_pass(self, state: Any) -> Any:
         """Turn arithmetic on whole arrays into loops."""
         return any(_is_rewritten(found, state.typemap) for found in _assignments(state)) and super().run_pass(state)
