@@ -4,8 +4,9 @@
 Numba gives each function machine code and a wrapper that Python calls. A kernel is inlined into the machine code of its
 callers, so both are thrown away. Here a function that is compiled inside another one ends as LLVM's code, simplified
 and no more: it is optimised as part of what it is inlined into. If Python calls such a function later, it is compiled
-once more, in full. Wrappers are not optimised: a call takes 20 nanoseconds more, of half a microsecond, and compiling a
-seventh less. Numba's own functions that ours call, such as ``np.empty``, are compiled in the same way, and kept.
+once more, in full. What Python calls is simplified after inlining only. Wrappers are not optimised: a call takes 20
+nanoseconds more, of half a microsecond, and compiling a seventh less. Numba's own functions that ours call, such as
+``np.empty``, are compiled in the same way, and kept.
 
 What comes out depends on sources alone, not on what was compiled before, by this process or others: of a function that
 Python has called, too, the form for linking is linked, and names are digests.
