@@ -61,6 +61,7 @@ class NormalGates:
     """Where what normal noise explains ends: levels that tests of all rooms share."""
 
     far: float = gate(3.0, "sigma", "of a difference that noise seldom makes", "derived from normal noise: 1 in 370")
+    coordinate: float = gate(3.5, "sigma", "of a coordinate that disagrees", "derived from normal noise: 1 in 2 000")
     mistake: float = gate(4.0, "sigma", "of a difference that is a mistake", "derived from normal noise: 1 in 16 000")
     sure: float = gate(5.0, "sigma", "of a difference that is stated as a fact", "convention: five sigma")
     outlier: float = gate(3e-3, "probability", "of a residual that noise exceeds", "convention: three sigma")

@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 
+from groma.gates import NORMAL
 from groma.geometry import quaternion, se3
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.gates import StartGates
@@ -43,14 +44,14 @@ def begun(pixels):
     found = []
     for motion in motions(CAMERA, pixels[0], pixels[1], GATES):
         start = Candidate(np.stack([IDENTITY, motion]), intersected(CAMERA, pixels[0], pixels[1], motion))
-        found.append(adjusted(CAMERA, start, pixels[:2], SIGMA, GATES.max_residual))
+        found.append(adjusted(CAMERA, start, pixels[:2], SIGMA, NORMAL.coordinate))
     return found
 
 
 def judged(candidates, pixels):
     """The same with a third view."""
     more = [continued(CAMERA, one, pixels[2], SIGMA, GATES) for one in candidates]
-    return [adjusted(CAMERA, one, pixels, SIGMA, GATES.max_residual) for one in more]
+    return [adjusted(CAMERA, one, pixels, SIGMA, NORMAL.coordinate) for one in more]
 
 
 def error(found, true):

@@ -29,6 +29,7 @@ from groma.features.segments import Segments
 from groma.gates import gate
 from groma.geometry import segment2
 from groma.mapping.photographs import read_gray
+from groma.mapping.wide_views import GATES as WIDE
 from groma.mapping.wide_views import WideDetection, WideViews
 from groma.scene import Scene
 
@@ -43,7 +44,6 @@ class LensGates:
     max_growth: float = gate(
         2.0, "1", "side of the resampled image over that of the original", "cost: wide lenses lose their corners"
     )
-    max_fold: float = gate(0.5, "px", "of a pixel that is bent and straightened again", "convention: half a pixel")
 
 
 GATES = LensGates()
@@ -119,7 +119,7 @@ class Straightener:
         inside = np.all((bent >= 0.0) & (bent <= np.array(self.size)), axis=1)
         # Far out, polynomial lens models fold the plane back into the image; only pixels that map back to it count.
         back = self.model.undistort_pixels(self.params, bent[inside]) + self._shift
-        inside[inside] = np.all(np.abs(back - pixels[inside]) < GATES.max_fold, axis=1)
+        inside[inside] = np.all(np.abs(back - pixels[inside]) < WIDE.max_fold, axis=1)
         return inside
 
     @property

@@ -26,6 +26,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.adjustment.assemble import assemble
+from groma.gates import NORMAL
 from groma.problem.problem import Problem
 from groma.problem.residuals import squared_norms
 from groma.solver.options import SolverOptions
@@ -90,7 +91,7 @@ def estimate_depth_offset(track_map: TrackMap, camera: TrackCamera, options: Tra
     information = curvature / alike
     total = information + 1.0 / prior**2
     offset = least * information / total
-    used = abs(offset) < options.gates.depth.max_offset * prior
+    used = abs(offset) < NORMAL.far * prior
     return DepthOffset(float(offset), float(total**-0.5), bool(used))
 
 

@@ -60,9 +60,6 @@ class DepthGates:
     min_images: int = gate(
         8, "images", "that tell an offset of inverse depths", "derived from the samples of a variance good to a half"
     )
-    max_offset: float = gate(
-        3.0, "sigma", "offset of inverse depths that is believed", "derived from normal noise: 1 in 370"
-    )
     max_misfit: float = gate(
         2.0,
         "ratio",

@@ -39,7 +39,6 @@ class StartGates:
     max_behind: float = gate(
         10.0, "nats", "a motion less likely by this than another one is ruled out", "derived from odds of 1 in 20 000"
     )
-    max_residual: float = gate(3.5, "sigma", "a pixel beyond it disagrees", "derived from normal noise: 1 in 2 000")
     max_error: float = gate(1.0, "px", "distance from an epipolar line", "convention: one pixel")
     max_depth: float = gate(
         50.0, "median depths", "points beyond tell no position", "derived from their share in it: a thousandth or less"
@@ -58,7 +57,6 @@ class DepthCheckGates:
     min_places: int = gate(40, "places", "places that must be known", SEQUENCES)
     confirms: float = gate(0.8, "share", "this share of the places confirms a pose", SEQUENCES)
     denies: float = gate(0.35, "share", "this share of the places seen through denies it", SEQUENCES)
-    sigma: float = gate(3.0, "sigma", "and this many standard deviations", "derived from normal noise: 1 in 370")
     smooth: float = gate(0.15, "share", "depths are read where four neighbours differ by less", SEQUENCES)
 
 

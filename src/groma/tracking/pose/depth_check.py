@@ -9,6 +9,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.features.depth.points import DEPTH_POINTS
+from groma.gates import NORMAL
 from groma.tracking.frame.camera import TrackCamera, back, into
 from groma.tracking.frame.depth import depth_sigma
 from groma.tracking.frame.features import grid_pixels, grid_shape
@@ -55,7 +56,7 @@ def depth_agreement(
     if known.sum() < check.min_places:
         return np.nan, np.nan
     measured, expected = measured[known], expected[known]
-    tolerance = DEPTH_POINTS.jump_share * measured + check.sigma * depth_sigma(measured, gates.depth)
+    tolerance = DEPTH_POINTS.jump_share * measured + NORMAL.far * depth_sigma(measured, gates.depth)
     away = measured - expected
     return float((np.abs(away) < tolerance).mean()), float((away > tolerance).mean())
 

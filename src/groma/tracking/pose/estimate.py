@@ -26,12 +26,13 @@ from groma.adjustment.pose_fit import (
     without_prior,
 )
 from groma.factors.losses import Cauchy, GemanMcClure, Loss
+from groma.gates import NORMAL
 from groma.tracking.frame.camera import TrackCamera, into
 from groma.tracking.frame.measurements import DEPTH_BASELINE, Measurements
 from groma.tracking.map.landmarks import MapView
 
 #: A residual beyond this many standard deviations is an outlier.
-GATE = 3.5
+GATE = NORMAL.coordinate
 #: What counts as a well-known direction: share of the median depth, and radians.
 WEAK_SHARE, WEAK_ANGLE = 0.02, math.radians(1.0)
 #: Losses, one after the other, under held landmarks.

@@ -16,6 +16,7 @@ from scipy.spatial import KDTree
 
 from groma._typing import FloatArray
 from groma.features.point_tracks import follow
+from groma.gates import NORMAL
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.features import FrameFeatures
 from groma.tracking.map.keyframes import Followed, add_keyframe
@@ -92,9 +93,9 @@ class Initialiser:
         judged = []
         for candidate in self._candidates:
             if len(candidate.poses) < len(views):
-                two = adjusted(self._camera, candidate, views[:2], sigma, gates.max_residual)
+                two = adjusted(self._camera, candidate, views[:2], sigma, NORMAL.coordinate)
                 candidate = continued(self._camera, two, views[2], sigma, gates)
-            judged.append(adjusted(self._camera, candidate, views, sigma, gates.max_residual))
+            judged.append(adjusted(self._camera, candidate, views, sigma, NORMAL.coordinate))
         left = likely(judged, gates)
         best = left[0]
         if best.agrees.sum() < max(gates.min_points, gates.min_inliers * len(best.agrees)):

@@ -29,6 +29,7 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray
 from groma.adjustment.assemble import assemble
 from groma.factors.losses import Cauchy
+from groma.gates import NORMAL
 from groma.geometry import quaternion, se3
 from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose
 from groma.scene import Cameras, PointObservations, Points, Scene
@@ -149,7 +150,7 @@ def continued(
 
     Points too far away to tell a position are left out; their numbers would spoil a closed form.
     """
-    max_error = gates.max_residual * sigma
+    max_error = NORMAL.coordinate * sigma
     near = candidate.agrees & (candidate.places[:, 2] < gates.max_depth)
     poses = [candidate.poses[-1]]
     if near.sum() >= 4:
