@@ -115,13 +115,7 @@ def calls_of(report: SolveReport) -> dict[str, int]:
     steps = report.iterations
     accepted = sum(step.accepted for step in report.history)
     ended = bool(report.history) and report.history[-1].accepted
-    return {
-        "linearize": 1 + accepted - ended,
-        "schur": steps,
-        "solve": steps,
-        "backsubstitute": steps,
-        "cost": steps,
-    }
+    return {"linearize": 1 + accepted - ended, "schur": steps, "solve": steps, "backsubstitute": steps, "cost": steps}
 
 
 def peak_rates() -> tuple[float, float]:

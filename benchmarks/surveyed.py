@@ -73,11 +73,7 @@ from groma.mapping.unused import without_unused
 from groma.scene import Relations, Scene
 from groma.solver.covariance.marginals import Covariances
 
-KINDS = {
-    "points": {"lines": False, "planes": False},
-    "+ lines": {"planes": False},
-    "+ planes": {},
-}
+KINDS = {"points": {"lines": False, "planes": False}, "+ lines": {"planes": False}, "+ planes": {}}
 NOISES = [f"{kind}, {noise}" for kind in ("points", "all") for noise in ("one noise", "own", "own and shared")]
 SUBSETS = [*KINDS, "lines help", "planes help"]
 #: Points that an image of a subset shares with another at least, and images a scene needs for random subsets.

@@ -32,10 +32,7 @@ from groma.solver.covariance.marginals import Covariances
 
 LENS, WIDTH, HEIGHT, NOISE = "SIMPLE_RADIAL", 1024, 768, 0.5
 ALONE = {"lines": False, "planes": False, "check_lens": False}
-WAYS = {
-    "held": {"refine_intrinsics": True, "refine_principal_point": False},
-    "estimated": {"refine_intrinsics": True},
-}
+WAYS = {"held": {"refine_intrinsics": True, "refine_principal_point": False}, "estimated": {"refine_intrinsics": True}}
 
 
 # ------------------------------------------------------------------------------------------------- surveyed scenes

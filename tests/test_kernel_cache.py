@@ -19,10 +19,7 @@ from groma._kernels import cache as kernel_cache
 from groma._kernels import digest as kernel_digest
 from groma._kernels import folder as kernel_folder
 
-pytestmark = [
-    pytest.mark.kernels,
-    pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled"),
-]
+pytestmark = [pytest.mark.kernels, pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled")]
 
 SOURCE = """
 from groma._numba import kernel, loop

@@ -19,10 +19,7 @@ from groma._kernels import cache as kernel_cache
 from groma._kernels import digest as kernel_digest
 from groma.cameras import dispatch as _dispatch
 
-pytestmark = [
-    pytest.mark.kernels,
-    pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled"),
-]
+pytestmark = [pytest.mark.kernels, pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled")]
 
 KERNELS = '''
 """Kernels."""

@@ -17,10 +17,7 @@ import groma
 from groma._kernels import digest as kernel_digest
 from groma._kernels import inner as kernel_inner
 
-pytestmark = [
-    pytest.mark.kernels,
-    pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled"),
-]
+pytestmark = [pytest.mark.kernels, pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled")]
 
 
 def _content(function, kinds=()):

@@ -21,10 +21,7 @@ from groma._kernels.cache import _Cache
 from groma._kernels.inner import Pipeline, _keeping_overloads, _NoMachineCode
 from groma.compiled import kernel, loop
 
-pytestmark = [
-    pytest.mark.kernels,
-    pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled"),
-]
+pytestmark = [pytest.mark.kernels, pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled")]
 
 
 def _made(decorate_inner, decorate_outer):

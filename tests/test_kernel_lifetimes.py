@@ -11,10 +11,7 @@ from numba.core.postproc import PostProcessor
 from groma._kernels import lifetimes
 from groma._numba import loop
 
-pytestmark = [
-    pytest.mark.kernels,
-    pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled"),
-]
+pytestmark = [pytest.mark.kernels, pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled")]
 
 
 def _nested(values, limit):

@@ -8,10 +8,7 @@ import pytest
 from groma._kernels import rewrites
 from groma._numba import loop
 
-pytestmark = [
-    pytest.mark.kernels,
-    pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled"),
-]
+pytestmark = [pytest.mark.kernels, pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled")]
 
 
 @loop

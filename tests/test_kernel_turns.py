@@ -13,10 +13,7 @@ import pytest
 from groma._kernels import inner as kernel_inner
 from groma._kernels import turns as kernel_turns
 
-pytestmark = [
-    pytest.mark.kernels,
-    pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled"),
-]
+pytestmark = [pytest.mark.kernels, pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled")]
 
 NAME, OTHER = "0123456789abcdef", "1123456789abcdef"
 

@@ -150,9 +150,7 @@ def num_calls() -> int:
 
 
 def map_work(
-    function: Callable[[_Item], _Result],
-    items: Sequence[_Item],
-    progress: Callable[[int, int], None] | None = None,
+    function: Callable[[_Item], _Result], items: Sequence[_Item], progress: Callable[[int, int], None] | None = None
 ) -> list[_Result]:
     """Return the results of a function of every item, in the order of the items.
 

@@ -55,11 +55,7 @@ def __dir__() -> list[str]:
 
 
 def check_manifold(
-    manifold: Manifold,
-    *,
-    rng: np.random.Generator | None = None,
-    count: int = 20,
-    tolerance: float = 1e-9,
+    manifold: Manifold, *, rng: np.random.Generator | None = None, count: int = 20, tolerance: float = 1e-9
 ) -> None:
     r"""Check that a chart keeps the contract of :class:`groma.geometry.manifold.Manifold`.
 

@@ -3,14 +3,7 @@
 
 import numpy as np
 import pytest
-from _survey import (
-    MARK_PX,
-    SIGMA,
-    made,
-    on_rigs,
-    with_everything,
-    with_objects,
-)
+from _survey import MARK_PX, SIGMA, made, on_rigs, with_everything, with_objects
 
 import groma
 from groma.adjustment.adjust import AdjustOptions, adjust

@@ -18,13 +18,7 @@ from groma.adjustment.uncertainty import position_sigma
 from groma.errors import InputError
 from groma.geometry import so3
 from groma.io.survey import PlanesFile
-from groma.scene import (
-    Directions,
-    Distances,
-    Held,
-    KnownPlanes,
-    Similarity,
-)
+from groma.scene import Directions, Distances, Held, KnownPlanes, Similarity
 from groma.scene.survey import Kind
 from groma.scene.synthetic.noise import project_pinhole
 from groma.scene.synthetic.scenes import holistic

@@ -5,15 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from _survey import (
-    ELSEWHERE,
-    SIGMA,
-    control_file,
-    made,
-    measured_positions,
-    places_of,
-    with_everything,
-)
+from _survey import ELSEWHERE, SIGMA, control_file, made, measured_positions, places_of, with_everything
 
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.assemble import assemble

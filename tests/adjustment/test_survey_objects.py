@@ -19,9 +19,7 @@ from groma.adjustment.survey.reliability import reliability
 from groma.errors import InputError
 from groma.geometry import incidence, line3, quaternion, se3
 from groma.io.survey import DirectionsFile, DistancesFile, PlanesFile
-from groma.scene import (
-    Distances,
-)
+from groma.scene import Distances
 from groma.scene.survey import Kind
 
 

@@ -13,13 +13,7 @@ from groma.adjustment.survey.reliability import reliability
 from groma.errors import InputError
 from groma.geometry import quaternion, se3
 from groma.io.survey import PosesFile
-from groma.scene import (
-    CameraPoses,
-    Held,
-    KnownDirections,
-    KnownPlanes,
-    PosePriors,
-)
+from groma.scene import CameraPoses, Held, KnownDirections, KnownPlanes, PosePriors
 
 
 @pytest.fixture(scope="module")

@@ -5,15 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from _survey import (
-    SIGMA,
-    control,
-    distances,
-    made,
-    positions,
-    with_everything,
-    with_objects,
-)
+from _survey import SIGMA, control, distances, made, positions, with_everything, with_objects
 
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.survey.reliability import noncentrality, reliability

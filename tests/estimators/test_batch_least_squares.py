@@ -119,9 +119,7 @@ def test_odd_cases():
     assert found.cost[1] == 0.0 and np.isfinite(found.states).all()
     assert found.cost[2] < 1e-3
     np.testing.assert_allclose(
-        found.states[[0, 3]],
-        solve_batch(DECAY, observed(t, y, pointers), start, 50).states[[0, 3]],
-        rtol=1e-12,
+        found.states[[0, 3]], solve_batch(DECAY, observed(t, y, pointers), start, 50).states[[0, 3]], rtol=1e-12
     )
     untouched = solve_batch(DECAY, observed(t, y, pointers, active), start, 0)
     np.testing.assert_array_equal(untouched.states, start)

@@ -15,15 +15,7 @@ pytestmark = pytest.mark.kernels
 GOLDEN = Path(__file__).resolve().parents[1] / "data" / "golden"
 BLOCKS = {
     "point": {"residual", "pose_left", "pose_right", "point", "intrinsics"},
-    "line_endpoint": {
-        "residual",
-        "pose_left",
-        "pose_right",
-        "line_left",
-        "line_right",
-        "line_plucker",
-        "intrinsics",
-    },
+    "line_endpoint": {"residual", "pose_left", "pose_right", "line_left", "line_right", "line_plucker", "intrinsics"},
     "line_normal": {
         "residual",
         "body_left",

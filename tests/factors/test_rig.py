@@ -105,8 +105,5 @@ def test_no_factors_in_a_rig():
 def test_extrinsics_must_fit():
     with pytest.raises(ShapeError, match="extrinsics must have one index per factor, 2 like its pose; got 1"):
         PointDepth(
-            pose=Ref("bodies", [0, 0]),
-            point=Ref("points", [0, 0]),
-            extrinsics=Ref("sensors", [0]),
-            depths=np.zeros(2),
+            pose=Ref("bodies", [0, 0]), point=Ref("points", [0, 0]), extrinsics=Ref("sensors", [0]), depths=np.zeros(2)
         )

@@ -61,11 +61,7 @@ def facade(folder, num_images=5, seed=0, model="SIMPLE_PINHOLE", extra=(), num_p
         pixels.append(seen[inside] + rng.normal(0, 0.2, (inside.sum(), 2)))
     scene = Scene.from_images(
         cameras=Cameras(
-            ids=np.array([1]),
-            models=(model,),
-            params=params[None],
-            width=np.array([WIDTH]),
-            height=np.array([HEIGHT]),
+            ids=np.array([1]), models=(model,), params=params[None], width=np.array([WIDTH]), height=np.array([HEIGHT])
         ),
         names=tuple(f"{i:04d}.png" for i in range(num_images)),
         camera_idx=np.zeros(num_images, np.int64),

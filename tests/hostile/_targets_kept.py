@@ -127,11 +127,7 @@ def _maps(work: Path) -> Iterator[Made]:
     arrays |= {"point_seen": np.array([[0, 0, 0], [1, 0, 0], [3, 0, 0]]), "line_seen": np.array([[0, 0, 0], [1, 0, 0]])}
     index = MapIndex(**{item.name: arrays[item.name] for item in fields(MapIndex)})
     index.write(work / "i.npz", "digest", work)
-    yield (
-        "map_index",
-        _files(work),
-        _index,
-    )
+    yield ("map_index", _files(work), _index)
     found = replace(
         unreadable("a.jpg", "a reason"), status="localized", pose=np.array([0.0, 0, 0, 1, 0, 0, 1]),
         covariance=np.eye(6), model="PINHOLE", params=np.array([9.0, 9.0, 5.0, 5.0]), size=np.array([10, 10]),

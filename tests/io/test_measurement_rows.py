@@ -7,12 +7,7 @@ import pytest
 from groma.errors import FileFormatError, InputError
 from groma.io.measured_poses import holds_covariances, read_camera_poses
 from groma.io.pose_files import read_poses
-from groma.io.survey import (
-    read_directions,
-    read_distances,
-    read_known_planes,
-    read_measured_poses,
-)  # fmt: skip
+from groma.io.survey import read_directions, read_distances, read_known_planes, read_measured_poses  # fmt: skip
 
 
 def written(tmp_path, text):

@@ -60,13 +60,7 @@ def document(true, kind: str, values: list[float]) -> dict:
         "sfm_data_version": "0.3",
         "root_path": "/somewhere/else",
         "views": [
-            {
-                "key": 10 + row,
-                "value": {
-                    "polymorphic_id": 1 << 30,
-                    "ptr_wrapper": {"id": NEW + row, "data": view(row)},
-                },
-            }
+            {"key": 10 + row, "value": {"polymorphic_id": 1 << 30, "ptr_wrapper": {"id": NEW + row, "data": view(row)}}}
             for row in count
         ],
         "intrinsics": [intrinsics(kind, values)],

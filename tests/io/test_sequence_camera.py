@@ -22,10 +22,7 @@ def test_a_camera_takes_lists_and_keeps_an_array_of_its_own():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (
-            ("PINHOLE", [50, 51, 32], 64, 48),
-            r"PINHOLE takes 4 finite numbers \(fx, fy, cx, cy\); got \[50.0",
-        ),
+        (("PINHOLE", [50, 51, 32], 64, 48), r"PINHOLE takes 4 finite numbers \(fx, fy, cx, cy\); got \[50.0"),
         (("PINHOLE", [50, 51, 32, 24, 0], 64, 48), "takes 4 finite numbers"),
         (("OPENCV", [50, 51, 32, 24], 64, 48), "takes 8 finite numbers"),
         (("PINHOLE", [50, np.nan, 32, 24], 64, 48), "takes 4 finite numbers"),

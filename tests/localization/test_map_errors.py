@@ -55,8 +55,7 @@ class _Map:
         ends = ends + rng.normal(0.0, noise, (*ends.shape[:2], 1)) * across[:, None]
         self.scene = self.truth.replace(
             point_observations=points.replace(
-                pixel=points.pixel + rng.normal(0.0, noise, points.pixel.shape),
-                sigma=np.full(len(points), NOISE),
+                pixel=points.pixel + rng.normal(0.0, noise, points.pixel.shape), sigma=np.full(len(points), NOISE)
             ),
             line_observations=lines.replace(segment=ends.reshape(-1, 4), sigma=np.full(len(lines), NOISE)),
         )

@@ -91,10 +91,7 @@ def test_corridor_has_its_walls_and_directions():
     assert same.any(axis=1).all()  # no plane that is not there
     assert same.any(axis=0).all()  # none is missing
     relations = structure.scene.relations
-    for name, places in (
-        ("point_on_plane", truth.points.xyz[:, None]),
-        ("line_on_plane", truth.lines.segments),
-    ):
+    for name, places in (("point_on_plane", truth.points.xyz[:, None]), ("line_on_plane", truth.lines.segments)):
         landmark, plane = getattr(relations, name).T
         nearest = true[same.argmax(axis=1)[plane]]
         height = np.abs(np.einsum("nei,ni->ne", places[landmark], nearest[:, :3]) + nearest[:, 3:]).max(axis=1)

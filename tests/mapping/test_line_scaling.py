@@ -150,10 +150,7 @@ def test_explanation_of_a_map_names_the_largest_groups_and_counts_the_rest():
         Outcome.AMBIGUOUS: 700,
     }
     text = explain(
-        line_map(
-            counts | {Outcome.OUTLIER: 600, Outcome.UNCERTAIN: 20, Outcome.NO_MATCH: 10},
-            num_lines=1200,
-        )
+        line_map(counts | {Outcome.OUTLIER: 600, Outcome.UNCERTAIN: 20, Outcome.NO_MATCH: 10}, num_lines=1200)
     )
     head, rest = text.split(". ", 1)
     assert head == "1,200 lines from 5,500 of 8,530 segments in 1 image"

@@ -100,10 +100,7 @@ def with_everything(truth, rng):
     """The scene with positions, control points and distances."""
     points, marks, xyz = control(truth, rng)
     return truth.replace(
-        camera_positions=positions(truth, rng),
-        control_points=points,
-        marks=marks,
-        distances=distances(truth, xyz, rng),
+        camera_positions=positions(truth, rng), control_points=points, marks=marks, distances=distances(truth, xyz, rng)
     )
 
 

@@ -86,10 +86,7 @@ def gapped():
         points=Points.at([[1.0, 0, 10], [4, 0, 10], [9, 0, 10]]),
         lines=Lines.through(ends),
         line_observations=LineObservations(image, line, segment),
-        relations=Relations(
-            point_on_line=[[0, 0], [1, 0], [2, 0]],
-            point_on_line_sigma=[0.1, 0.2, 0.3],
-        ),
+        relations=Relations(point_on_line=[[0, 0], [1, 0], [2, 0]], point_on_line_sigma=[0.1, 0.2, 0.3]),
     )
 
 

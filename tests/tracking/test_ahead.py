@@ -98,8 +98,7 @@ def test_another_frame_than_the_one_announced_is_tracked_as_it_is():
     for frame, announced in [(frames[0], frames[4]), *pairwise(frames[1:])]:
         tracker.process(frame, announced)
     np.testing.assert_array_equal(
-        tracker.finish().trajectory.world_from_cam,
-        _tracked(frames[:6], ahead=False)[1].trajectory.world_from_cam,
+        tracker.finish().trajectory.world_from_cam, _tracked(frames[:6], ahead=False)[1].trajectory.world_from_cam
     )
 
 

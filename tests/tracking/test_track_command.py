@@ -90,10 +90,7 @@ def test_less_of_it(sequence, tmp_path):
 
 @pytest.mark.parametrize(
     ("arguments", "word"),
-    [
-        (["--kind", "sonar"], "rgbd, stereo or mono"),
-        (["--no-points", "--no-lines", "--no-planes"], "Nothing to track"),
-    ],
+    [(["--kind", "sonar"], "rgbd, stereo or mono"), (["--no-points", "--no-lines", "--no-planes"], "Nothing to track")],
 )
 def test_what_it_refuses(sequence, tmp_path, arguments, word):
     result = _run(sequence, "-o", tmp_path / "no", "--camera", CAMERA, *arguments)

@@ -103,8 +103,7 @@ def test_long_lines_are_red_and_short_ones_blue(scene):
 def test_lines_of_one_direction_have_one_colour(scene):
     along = np.array([[0, 0], [3, 0], [1, 1], [4, 1]])
     shared = scene.replace(
-        directions=Directions(np.array([1, 2]), np.eye(3)[:2]),
-        relations=Relations(line_along_direction=along),
+        directions=Directions(np.array([1, 2]), np.eye(3)[:2]), relations=Relations(line_along_direction=along)
     )
     colours = view_content(shared).line_colours("shared direction").colours
     assert (colours[0] == colours[3]).all() and (colours[1] == colours[4]).all()

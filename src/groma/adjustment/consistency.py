@@ -94,12 +94,7 @@ class ConsistencyReport:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report as plain values, for JSON."""
-        return {
-            "passed": self.passed,
-            "runs": self.runs,
-            "seed": self.seed,
-            "rows": [asdict(row) for row in self.rows],
-        }
+        return {"passed": self.passed, "runs": self.runs, "seed": self.seed, "rows": [asdict(row) for row in self.rows]}
 
 
 def consistency(

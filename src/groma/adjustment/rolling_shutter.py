@@ -135,10 +135,7 @@ class Motions:
             "expected_sigma": {"shift": self.sigma[0], "turn_deg": float(np.degrees(self.sigma[1]))},
             "share_of_interval": self.share or None,
             "explained": self.explained,
-            "determined": {
-                "shift": float(self.redundancy[:, :3].mean()),
-                "turn": float(self.redundancy[:, 3:].mean()),
-            },
+            "determined": {"shift": float(self.redundancy[:, :3].mean()), "turn": float(self.redundancy[:, 3:].mean())},
             "notes": list(self.sentences()),
         }
 
@@ -189,9 +186,7 @@ def with_rolling_shutter(scene: Scene, along: str = "rows") -> Scene:
 
 
 def adjust_rolling_shutter(
-    scene: Scene,
-    options: AdjustOptions | None = None,
-    progress: Callable[[Progress], bool | None] | None = None,
+    scene: Scene, options: AdjustOptions | None = None, progress: Callable[[Progress], bool | None] | None = None
 ) -> RollingShutterResult:
     """Adjust a scene with motions during the readout, and estimate how well these are known beforehand.
 
@@ -236,11 +231,7 @@ def motions_of(scene: Scene, problem: Problem | None) -> Motions:
     left = share_of**2 * (free - share * between) ** 2
     variance = [left[:, part].sum() / max(share_of[:, part].sum(), 1e-9) for part in (slice(0, 3), slice(3, 6))]
     return Motions(
-        table.motion,
-        share_of,
-        (float(np.sqrt(variance[0])), float(np.sqrt(variance[1]))),
-        share,
-        _spread(scene, table),
+        table.motion, share_of, (float(np.sqrt(variance[0])), float(np.sqrt(variance[1]))), share, _spread(scene, table)
     )
 
 

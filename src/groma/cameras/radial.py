@@ -231,8 +231,5 @@ RADIAL = register_camera(
     radial_unproject,
 )
 BAL = register_camera(
-    CameraModel("BAL", ("f", "k1", "k2"), (0,), (), (1, 2), None),
-    bal_project,
-    bal_project_jacobian,
-    bal_unproject,
+    CameraModel("BAL", ("f", "k1", "k2"), (0,), (), (1, 2), None), bal_project, bal_project_jacobian, bal_unproject
 )

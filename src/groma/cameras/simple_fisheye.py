@@ -148,13 +148,7 @@ FISHEYE = register_camera(
 )
 SIMPLE_RADIAL_FISHEYE = register_camera(
     CameraModel(
-        "SIMPLE_RADIAL_FISHEYE",
-        ("f", "cx", "cy", "k"),
-        (0,),
-        (1, 2),
-        (3,),
-        "SIMPLE_RADIAL_FISHEYE",
-        sees_behind=True,
+        "SIMPLE_RADIAL_FISHEYE", ("f", "cx", "cy", "k"), (0,), (1, 2), (3,), "SIMPLE_RADIAL_FISHEYE", sees_behind=True
     ),
     simple_radial_fisheye_project,
     simple_radial_fisheye_project_jacobian,

@@ -121,11 +121,7 @@ class _Found:
 
 
 def parallel_lines(
-    directions: FloatArray,
-    covariance: FloatArray,
-    sigma: float,
-    turned: FloatArray | None,
-    wanted: Acceptance,
+    directions: FloatArray, covariance: FloatArray, sigma: float, turned: FloatArray | None, wanted: Acceptance
 ) -> ParallelLines:
     """Find the directions that lines share; ``turned`` None: ends do not deviate. See the module."""
     px = np.zeros(1) if turned is None else np.concatenate([[PARALLEL.start_px, 0.0], PARALLEL.deviations])

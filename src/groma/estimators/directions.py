@@ -107,9 +107,7 @@ class DirectionSet:
 
 # -------------------------------------------------------------------------------------------------------------- Public
 def directions_from_normals(
-    normals: FloatArray,
-    factors: FloatArray,
-    options: DirectionOptions | None = None,
+    normals: FloatArray, factors: FloatArray, options: DirectionOptions | None = None
 ) -> DirectionSet:
     r"""Find directions perpendicular to many unit normals: vanishing directions of segments.
 
@@ -201,9 +199,7 @@ def directions_from_lines(
 
 
 def orthogonal_pairs(
-    directions: FloatArray,
-    covariance: FloatArray,
-    sigma: float = DIRECTIONS.orthogonal_sigma,
+    directions: FloatArray, covariance: FloatArray, sigma: float = DIRECTIONS.orthogonal_sigma
 ) -> IntArray:
     r"""Pairs of directions that are orthogonal within their uncertainty.
 
@@ -314,10 +310,4 @@ def _score(pool: Perpendicular, candidates: FloatArray, gate: float) -> FloatArr
     return -(agreement * np.log(np.maximum(pool.chance(candidates, gate), 1e-12))).sum(axis=1)
 
 
-__all__ = [
-    "DirectionOptions",
-    "DirectionSet",
-    "directions_from_lines",
-    "directions_from_normals",
-    "orthogonal_pairs",
-]
+__all__ = ["DirectionOptions", "DirectionSet", "directions_from_lines", "directions_from_normals", "orthogonal_pairs"]

@@ -104,10 +104,7 @@ def segment_normals(
 
 
 def find_vanishing_points(
-    ends: FloatArray,
-    sigma: float | FloatArray,
-    model: CameraModel,
-    params: FloatArray,
+    ends: FloatArray, sigma: float | FloatArray, model: CameraModel, params: FloatArray
 ) -> VanishingPoints:
     """Find the vanishing points of an image.
 
@@ -133,11 +130,5 @@ def find_vanishing_points(
     label[good] = found.label
     front = np.where(found.vectors[:, 2:] < 0.0, -1.0, 1.0)
     return VanishingPoints(
-        found.vectors * front,
-        found.covariance,
-        found.log10_false_alarms,
-        label,
-        found.orthogonal,
-        normals,
-        factors,
+        found.vectors * front, found.covariance, found.log10_false_alarms, label, found.orthogonal, normals, factors
     )

@@ -241,10 +241,7 @@ def inner_segment_distance(first: FloatArray, second: FloatArray) -> FloatArray:
 
 # --------------------------------------------------------------------------------------------------- Scale-invariant
 def scale_invariant_endpoint_distance(
-    first: FloatArray,
-    second: FloatArray,
-    first_depths: FloatArray,
-    second_depths: FloatArray | None = None,
+    first: FloatArray, second: FloatArray, first_depths: FloatArray, second_depths: FloatArray | None = None
 ) -> FloatArray:
     r"""Greatest distance (...) of corresponding end points over the depth.
 

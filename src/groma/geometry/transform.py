@@ -112,10 +112,7 @@ def rigid_lines_wrt_twist(lines_in_b: FloatArray) -> FloatArray:
     lines_in_b = vectors(lines_in_b, 6, "lines_in_b")
     moment, direction = -hat(lines_in_b[..., :3]), -hat(lines_in_b[..., 3:])
     return np.concatenate(
-        [
-            np.concatenate([direction, moment], axis=-1),
-            np.concatenate([np.zeros_like(direction), direction], axis=-1),
-        ],
+        [np.concatenate([direction, moment], axis=-1), np.concatenate([np.zeros_like(direction), direction], axis=-1)],
         axis=-2,
     )
 

@@ -132,10 +132,7 @@ def read_trajectory(
 
 
 def write_trajectory(
-    trajectory: Trajectory,
-    path: str | os.PathLike[str],
-    format: str = "tum",
-    force: bool = False,
+    trajectory: Trajectory, path: str | os.PathLike[str], format: str = "tum", force: bool = False
 ) -> None:
     """Write a trajectory, whole or not at all.
 

@@ -57,12 +57,7 @@ class ExtendedModel:
 
 
 def extended_model(
-    localizer: Localizer,
-    files: Mapping[str, Path],
-    work: Path,
-    folder: Path,
-    choice: CalibrationChoice,
-    say: Progress,
+    localizer: Localizer, files: Mapping[str, Path], work: Path, folder: Path, choice: CalibrationChoice, say: Progress
 ) -> ExtendedModel:
     """Return the model of a map and new photographs.
 

@@ -98,12 +98,7 @@ class SeenLines:
 
 
 def lines_near(
-    camera: QueryCamera,
-    pose: FloatArray,
-    seen: SeenLines,
-    segments: Segments,
-    descriptors: Descriptors,
-    reach: float,
+    camera: QueryCamera, pose: FloatArray, seen: SeenLines, segments: Segments, descriptors: Descriptors, reach: float
 ) -> IntArray:
     """Return pairs (n, 2) of lines and segments that are near each other under a pose, and look alike.
 

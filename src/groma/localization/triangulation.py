@@ -63,10 +63,7 @@ class PointMap:
 
 
 def triangulate_features(
-    scene: Scene,
-    features: Sequence[DescribedPoints],
-    pairs: IntArray,
-    say: Callable[[int, int], None],
+    scene: Scene, features: Sequence[DescribedPoints], pairs: IntArray, say: Callable[[int, int], None]
 ) -> PointMap:
     """Match the features of pairs (n, 2) of images, and triangulate them.
 

@@ -201,11 +201,7 @@ class Stages(Generic[_Options]):
         return self.folder / f"{name}-{self._key[:_KEY_LENGTH]}.npz"
 
     def _kept(
-        self,
-        stage: Stage[_Options, _Result],
-        path: Path,
-        values: tuple[Any, ...],
-        say: Callable[[str, int, int], None],
+        self, stage: Stage[_Options, _Result], path: Path, values: tuple[Any, ...], say: Callable[[str, int, int], None]
     ) -> _Result:
         """Return what a file holds, or make it."""
         kind, name = stage.kind, path.stem[: -_KEY_LENGTH - 1]

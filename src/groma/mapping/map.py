@@ -268,10 +268,7 @@ def adjust_points(start: Scene, options: MapOptions, say: StageProgress) -> Scen
 def measure_points(folder: Path, points: Scene, options: MapOptions, say: StageProgress) -> Scene:
     """Points measured again in the photographs, and adjusted with the noise they have then."""
     found = refine_points(
-        points,
-        image_reader(folder, points.images.names),
-        noise_px(points, "points"),
-        partial(say, "measuring points"),
+        points, image_reader(folder, points.images.names), noise_px(points, "points"), partial(say, "measuring points")
     )
     weighted = dataclasses.replace(options.adjustment(), point_sigma_px=found.sigma_px)
     return _adjusted(found.scene, weighted, say, "adjusting points again").scene

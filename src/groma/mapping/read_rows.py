@@ -19,12 +19,7 @@ from groma._trees import kd_tree
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult
-from groma.adjustment.rolling_shutter import (
-    AXES,
-    NOT_ROLLING,
-    adjust_rolling_shutter,
-    with_rolling_shutter,
-)
+from groma.adjustment.rolling_shutter import AXES, NOT_ROLLING, adjust_rolling_shutter, with_rolling_shutter
 from groma.adjustment.terms.readout import motion_of, offsets_of
 from groma.cameras import model as camera_model
 from groma.errors import InputError

@@ -61,10 +61,7 @@ class PointRefinement:
 
 
 def refine_points(
-    scene: Scene,
-    read: Callable[[int], GrayImage],
-    sigma_px: float,
-    progress: Callable[[int, int], None] | None = None,
+    scene: Scene, read: Callable[[int], GrayImage], sigma_px: float, progress: Callable[[int, int], None] | None = None
 ) -> PointRefinement:
     """Place the point observations of a scene anew by the grey levels around them.
 

@@ -99,9 +99,7 @@ def _is_unknown(options: MapOptions) -> bool:
 
 
 @stage(
-    "placed",
-    PLACED,
-    lambda o: (o.point_model(threads=False), o.refine_poses, o.refine_intrinsics, o.max_iterations),
+    "placed", PLACED, lambda o: (o.point_model(threads=False), o.refine_poses, o.refine_intrinsics, o.max_iterations)
 )
 def place_at_poses(
     folder: Path, given: Scene, place: Callable[[str], Path], options: MapOptions, say: StageProgress

@@ -28,11 +28,7 @@ from groma.problem.problem import Problem
 
 
 def gauge_directions(
-    manifold: Manifold,
-    state: FloatArray,
-    center: FloatArray | None = None,
-    length: float = 1.0,
-    mounted: bool = False,
+    manifold: Manifold, state: FloatArray, center: FloatArray | None = None, length: float = 1.0, mounted: bool = False
 ) -> FloatArray:
     """Increments (7, count, dof) of variables under the seven world motions.
 

@@ -17,14 +17,7 @@ import numpy as np
 from groma._typing import IntArray
 from groma.problem._draft import Draft
 from groma.problem._partition import choose_landmarks, kept_classes
-from groma.problem.layout import (
-    CHUNK_SIZE,
-    Chunk,
-    Eliminated,
-    FactorLayout,
-    Incidences,
-    Layout,
-)
+from groma.problem.layout import CHUNK_SIZE, Chunk, Eliminated, FactorLayout, Incidences, Layout
 from groma.problem.problem import Problem, under_loss
 from groma.problem.sorting import PairTable, argsort_by, distinct_pairs, first_and_last
 from groma.problem.tied import Divided, with_tied_apart

@@ -22,21 +22,13 @@ ROUNDING = 1e-14
 class Termination(Enum):
     """Why a solve stopped; ``sentence`` explains it, with causes and remedies."""
 
-    COST_CONVERGED = (
-        "cost_converged",
-        True,
-        "Converged: a step changes the cost by less than function_tolerance.",
-    )
+    COST_CONVERGED = ("cost_converged", True, "Converged: a step changes the cost by less than function_tolerance.")
     GRADIENT_CONVERGED = (
         "gradient_converged",
         True,
         "Converged: the gradient has vanished (its largest component is below gradient_tolerance).",
     )
-    STEP_CONVERGED = (
-        "step_converged",
-        True,
-        "Converged: steps have become negligible (below step_tolerance).",
-    )
+    STEP_CONVERGED = ("step_converged", True, "Converged: steps have become negligible (below step_tolerance).")
     MAX_ITERATIONS = (
         "max_iterations",
         False,
@@ -75,11 +67,7 @@ class Termination(Enum):
         "their focal plane, lines through camera centres), (b) all have a sqrt_information of zero, (c) all lie beyond "
         "a loss that rejects them (take a wider loss_scale). Nothing was moved; check poses, landmarks and noise.",
     )
-    NOTHING_TO_DO = (
-        "nothing_to_do",
-        True,
-        "Nothing to solve: there are no factors, or everything is held constant.",
-    )
+    NOTHING_TO_DO = ("nothing_to_do", True, "Nothing to solve: there are no factors, or everything is held constant.")
     STOPPED_BY_CALLER = (
         "stopped_by_caller",
         False,

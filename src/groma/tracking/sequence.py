@@ -251,10 +251,7 @@ def _logged(progress: _Told | None) -> _Told:
 
 
 def _loaded(
-    earlier: SavedMap | None,
-    sequence: Sequence,
-    options: TrackOptions | None,
-    progress: _Told,
+    earlier: SavedMap | None, sequence: Sequence, options: TrackOptions | None, progress: _Told
 ) -> TrackMap | None:
     """Return the map of an earlier track."""
     if earlier is None:
@@ -268,11 +265,7 @@ def _loaded(
 
 
 def _follow(
-    tracker: Tracker,
-    sequence: Sequence,
-    frames: list[TrackedFrame],
-    progress: _Told,
-    journal: Journal | None,
+    tracker: Tracker, sequence: Sequence, frames: list[TrackedFrame], progress: _Told, journal: Journal | None
 ) -> tuple[Tracker, bool]:
     """Track all frames and append them to ``frames``; return the tracker and whether the sequence was completed.
 

@@ -134,9 +134,7 @@ def rms_by_group(lengths: FloatArray, group: IntArray, size: int, empty: float =
 
 
 def _by_camera(
-    scene: Scene,
-    image_idx: IntArray,
-    function: Callable[[CameraModel, FloatArray, IntArray], FloatArray],
+    scene: Scene, image_idx: IntArray, function: Callable[[CameraModel, FloatArray, IntArray], FloatArray]
 ) -> FloatArray:
     """Call ``function(model, params, rows)`` once per camera model, with a row of parameters per observation."""
     result = np.full((len(image_idx), 2), np.nan)

@@ -8,11 +8,7 @@ from groma.factors import Invariance, factor
 
 
 @factor(
-    "gravity",
-    slots=[("pose", "pose")],
-    residual_size=3,
-    data_size=3,
-    invariance=Invariance(rotation=(0.0, 0.0, 1.0)),
+    "gravity", slots=[("pose", "pose")], residual_size=3, data_size=3, invariance=Invariance(rotation=(0.0, 0.0, 1.0))
 )
 def Gravity(data, pose, out):  # noqa: N802 - becomes a class
     """Down, a unit vector in the camera, is measured."""

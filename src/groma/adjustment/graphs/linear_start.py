@@ -89,10 +89,7 @@ def _solved(matrix: csc_array, wanted: FloatArray, known: FloatArray, free: Bool
     target = part.T @ (wanted - matrix[:, ~free] @ known[~free])
     try:
         factor = splu(
-            (part.T @ part).tocsc(),
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
+            (part.T @ part).tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
         result[free] = factor.solve(np.asarray(target))
     except RuntimeError:  # singular

@@ -117,9 +117,7 @@ class PoseGraphResult:
 
 
 def adjust_pose_graph(
-    graph: PoseGraph,
-    options: PoseGraphOptions | None = None,
-    progress: Callable[[Progress], bool | None] | None = None,
+    graph: PoseGraph, options: PoseGraphOptions | None = None, progress: Callable[[Progress], bool | None] | None = None
 ) -> PoseGraphResult:
     """Adjust the poses of a graph; in each connected component without a held pose, the first one is held.
 
@@ -188,10 +186,7 @@ def pose_graph_problem(graph: PoseGraph, options: PoseGraphOptions | None = None
 
 
 def motion_problem(
-    body_from_world: FloatArray,
-    constant: BoolArray,
-    motions: Motions,
-    losses: Sequence[tuple[IntArray, Loss]],
+    body_from_world: FloatArray, constant: BoolArray, motions: Motions, losses: Sequence[tuple[IntArray, Loss]]
 ) -> Problem:
     """Return the problem of poses with motions measured between them.
 

@@ -67,9 +67,7 @@ class SimilarityGraphResult:
 
 
 def adjust_similarity_graph(
-    cam_from_world: FloatArray,
-    motions: SimilarityMotions,
-    options: SolverOptions | None = None,
+    cam_from_world: FloatArray, motions: SimilarityMotions, options: SolverOptions | None = None
 ) -> SimilarityGraphResult:
     """Adjust cameras, each with a scale, to the similarities measured between them.
 

@@ -10,12 +10,4 @@ variables of parts, ``adjust.py`` solves and writes them, and ``checkpoint.py`` 
 from groma.adjustment.parts.adjust import PartsResult, adjust_parts
 from groma.adjustment.parts.cut import PART_SIZE, join_parts, num_ties_cut, parts_of, write_parts
 
-__all__ = [
-    "PART_SIZE",
-    "PartsResult",
-    "adjust_parts",
-    "join_parts",
-    "num_ties_cut",
-    "parts_of",
-    "write_parts",
-]
+__all__ = ["PART_SIZE", "PartsResult", "adjust_parts", "join_parts", "num_ties_cut", "parts_of", "write_parts"]

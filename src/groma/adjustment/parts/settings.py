@@ -7,13 +7,7 @@ import os
 from dataclasses import fields
 from typing import Any
 
-from groma.adjustment.adjust import (
-    AdjustOptions,
-    assembly_options_of,
-    losses_of,
-    relation_loss_of,
-    start_tolerance_of,
-)
+from groma.adjustment.adjust import AdjustOptions, assembly_options_of, losses_of, relation_loss_of, start_tolerance_of
 from groma.factors.losses import Loss
 from groma.io.archive import read_archive
 from groma.solver.options import SolverOptions

@@ -21,12 +21,7 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.adjustment.assemble import camera_variables, structure_variables
 from groma.adjustment.assembly_options import AssemblyOptions
-from groma.adjustment.terms import (
-    camera_poses,
-    control_points,
-    distances,
-    known_geometry,
-)
+from groma.adjustment.terms import camera_poses, control_points, distances, known_geometry
 from groma.adjustment.terms.contract import Draft
 from groma.factors.contract import Factor
 from groma.geometry import line3, so3

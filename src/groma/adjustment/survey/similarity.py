@@ -112,9 +112,7 @@ def _fitted(source: FloatArray, target: FloatArray) -> RobustSimilarity:
         if unchanged:
             break
     whole = Similarity(
-        best.scale,
-        best.rotation,
-        target.mean(0) + best.translation - best.scale * best.rotation @ source.mean(0),
+        best.scale, best.rotation, target.mean(0) + best.translation - best.scale * best.rotation @ source.mean(0)
     )
     spread = np.linalg.svd(y[inliers] - y[inliers].mean(0), compute_uv=False) / np.sqrt(max(inliers.sum(), 1))
     on_line = bool(spread[1] <= max(NORMAL.far * scatter, 1e-9 * spread[0]))

@@ -134,10 +134,7 @@ def _information_on_scale(scene: Scene) -> float:
     found = [
         (se3.inverse(frames)[table.frame_idx, 4:], _in_world(priors, frames[table.frame_idx])),
         (centers[positions.image_idx], positions.covariance),
-        (
-            centers[poses.image_idx],
-            _in_world(poses.covariance[:, :3, :3], scene.cam_from_world[poses.image_idx]),
-        ),
+        (centers[poses.image_idx], _in_world(poses.covariance[:, :3, :3], scene.cam_from_world[poses.image_idx])),
         (points.xyz[control], points.covariance[control]),
     ]
     places, covariances = (np.concatenate(part) for part in zip(*found, strict=True))

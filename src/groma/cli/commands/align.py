@@ -22,8 +22,7 @@ def align(
     console: Console,
     source: _options.Input,
     reference: Annotated[
-        Path | None,
-        typer.Argument(metavar="REFERENCE", help="A scene with images of the same names, of any format."),
+        Path | None, typer.Argument(metavar="REFERENCE", help="A scene with images of the same names, of any format.")
     ] = None,
     output: Annotated[
         Path | None, _options.PLAIN.option("Folder or file for the aligned scene.", "--output", "-o", metavar="OUT")

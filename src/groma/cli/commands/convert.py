@@ -32,8 +32,7 @@ def convert(
     parts: Annotated[
         bool,
         _options.PLAIN.option(
-            "Divide the scene into parts in the folder OUTPUT, for groma adjust in one process or many.",
-            "--parts",
+            "Divide the scene into parts in the folder OUTPUT, for groma adjust in one process or many.", "--parts"
         ),
     ] = False,
     part_size: Annotated[

@@ -161,8 +161,7 @@ def planes(
     console: Console,
     estimate: Annotated[Path, typer.Argument(metavar="EST", help="Scene to evaluate.")],
     reference: Annotated[
-        Path,
-        typer.Argument(metavar="REF", help="Reference: scene with planes, or points (.ply, .obj, .npy, .npz)."),
+        Path, typer.Argument(metavar="REF", help="Reference: scene with planes, or points (.ply, .obj, .npy, .npz).")
     ],
     threshold: _Thresholds = None,
     max_angle: Annotated[
@@ -256,14 +255,7 @@ def trajectory(
     if times is not None:
         theirs = read_trajectory(reference, format, read_times(times))
         console.detail(f"The poses of {reference} have the times of {times}.")
-    scores = score_trajectory(
-        ours,
-        theirs,
-        align,
-        max_time_difference,
-        rpe_delta,
-        rpe_unit,
-    )
+    scores = score_trajectory(ours, theirs, align, max_time_difference, rpe_delta, rpe_unit)
     for warning in scores.warnings:
         console.warn(warning)
     applied = {"se3": "rotation and translation", "sim3": f"similarity of scale {scores.similarity.scale:.6g}"}

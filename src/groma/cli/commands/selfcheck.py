@@ -28,8 +28,7 @@ def selfcheck(
         _options.PLAIN.option("Folder of reference values (*.json) to compare with as well.", metavar="DIR"),
     ] = None,
     nees: Annotated[
-        bool,
-        _options.PLAIN.option("Check covariances instead, against errors of simulated scenes.", "--nees"),
+        bool, _options.PLAIN.option("Check covariances instead, against errors of simulated scenes.", "--nees")
     ] = False,
     runs: Annotated[int, _options.PLAIN.option("With --nees: simulated scenes per gauge.", min=2, metavar="N")] = _RUNS,
     seed: _options.Seed = 0,

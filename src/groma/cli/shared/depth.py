@@ -25,14 +25,12 @@ Depth = Annotated[
     ),
 ]
 DepthScale = Annotated[
-    float | None,
-    PANEL.option("Depth values per metre. Default: 1000 for integers, 1 for floating point.", metavar="S"),
+    float | None, PANEL.option("Depth values per metre. Default: 1000 for integers, 1 for floating point.", metavar="S")
 ]
 RelativeDepth = Annotated[
     bool,
     PANEL.option(
-        "Estimate a scale for each depth map, as for monocular depth networks.",
-        "--relative-depth/--metric-depth",
+        "Estimate a scale for each depth map, as for monocular depth networks.", "--relative-depth/--metric-depth"
     ),
 ]
 

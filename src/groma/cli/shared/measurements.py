@@ -60,8 +60,7 @@ class Measured:
     ] = None
     control: Control = None
     control_sigma: Annotated[
-        str | None,
-        PANEL.option("Standard deviation of control points; or horizontal, vertical.", metavar="S[,S[,S]]"),
+        str | None, PANEL.option("Standard deviation of control points; or horizontal, vertical.", metavar="S[,S[,S]]")
     ] = None
     mark_sigma: Annotated[float, PANEL.option("Standard deviation of marks, pixels.", metavar="PX", min=1e-3)] = 1.0
     check: Annotated[str | None, PANEL.option("Control points to hold out as check points.", metavar="NAME,...")] = None
@@ -85,8 +84,7 @@ class Measured:
         ),
     ] = None
     direction_sigma: Annotated[
-        float | None,
-        PANEL.option("Standard deviation of directions without one in the file, degrees.", metavar="DEG"),
+        float | None, PANEL.option("Standard deviation of directions without one in the file, degrees.", metavar="DEG")
     ] = None
     known_planes: Annotated[
         Path | None,
@@ -96,8 +94,7 @@ class Measured:
         ),
     ] = None
     plane_sigma: Annotated[
-        float | None,
-        PANEL.option("Standard deviation of known planes without one in the file.", metavar="S"),
+        float | None, PANEL.option("Standard deviation of known planes without one in the file.", metavar="S")
     ] = None
     poses: Annotated[
         Path | None,
@@ -116,15 +113,11 @@ class Measured:
     ] = None
     hold: Annotated[
         str | None,
-        PANEL.option(
-            "Images (also old/*), control points and landmarks (line:5) to hold fixed.",
-            metavar="NAME,...",
-        ),
+        PANEL.option("Images (also old/*), control points and landmarks (line:5) to hold fixed.", metavar="NAME,..."),
     ] = None
     crs: Crs = None
     keep_suspects: Annotated[
-        bool,
-        PANEL.option("Report gross errors, but keep them in the adjustment.", "--keep-suspects"),
+        bool, PANEL.option("Report gross errors, but keep them in the adjustment.", "--keep-suspects")
     ] = False
 
     def validate(self) -> None:

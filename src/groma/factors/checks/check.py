@@ -238,10 +238,7 @@ def _check_degenerate(name: str, example: Example) -> None:
 
 
 def check_factor(
-    factor: type[Factor] | Factor | Example,
-    rng: np.random.Generator | None = None,
-    *,
-    tolerance: float = TOLERANCE,
+    factor: type[Factor] | Factor | Example, rng: np.random.Generator | None = None, *, tolerance: float = TOLERANCE
 ) -> FactorCheck:
     """Check that a factor keeps its contract.
 

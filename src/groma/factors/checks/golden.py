@@ -165,10 +165,7 @@ def _plane_quaternion(x: Blocks) -> Blocks:
 FILES = {
     "point": (_point, {"q_CW": 4, "t_CW": 3, "K": 4, "X_W": 3, "uv": 2}),
     "line_endpoint": (_line_endpoint, {"q_CW": 4, "t_CW": 3, "K": 4, "m_W": 3, "d_W": 3, "x_s": 2, "x_e": 2}),
-    "line_normal": (
-        _line_normal,
-        {"n_C": 3, "q_CB": 4, "t_CB": 3, "q_BW": 4, "t_BW": 3, "q_WL": 4, "d_L": 1},
-    ),
+    "line_normal": (_line_normal, {"n_C": 3, "q_CB": 4, "t_CB": 3, "q_BW": 4, "t_BW": 3, "q_WL": 4, "d_L": 1}),
     "plane_quaternion": (_plane_quaternion, {"q_CW": 4, "t_CW": 3, "pi_C": 4, "pi_W": 4}),
 }
 

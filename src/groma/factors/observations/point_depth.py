@@ -25,15 +25,7 @@ import numpy as np
 from groma._numba import loop
 from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices, make_example, visible_scene
-from groma.factors._rig import (
-    EXTRINSICS,
-    POSE,
-    CameraFactor,
-    clear_record,
-    put_point,
-    put_point_pose,
-    transform_point,
-)
+from groma.factors._rig import EXTRINSICS, POSE, CameraFactor, clear_record, put_point, put_point_pose, transform_point
 from groma.factors.contract import Example, Ref, Slot, register
 
 

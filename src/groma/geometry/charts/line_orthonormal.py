@@ -41,14 +41,7 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import FloatArray, IntArray
 from groma.geometry import quaternion
-from groma.geometry.charts.chart import (
-    Chart,
-    minus_skew_kernel,
-    perpendicular,
-    turn_and_add_all,
-    turn_between,
-    unit,
-)
+from groma.geometry.charts.chart import Chart, minus_skew_kernel, perpendicular, turn_and_add_all, turn_between, unit
 from groma.geometry.quaternion import to_matrix_kernel
 
 

@@ -21,15 +21,7 @@ from groma.io.colmap.load import load_pycolmap
 from groma.io.colmap.model import from_pycolmap, to_pycolmap
 from groma.io.colmap.pairs import blocks_of_pairs
 from groma.io.colmap.quiet import quiet
-from groma.io.colmap.sfm import (
-    PointModelOptions,
-    Progress,
-    _check_room,
-    _explained,
-    _find_features,
-    _match,
-    _opened,
-)
+from groma.io.colmap.sfm import PointModelOptions, Progress, _check_room, _explained, _find_features, _match, _opened
 from groma.scene import PosePriors, Scene
 
 #: Matches that a pair of images, or an image and a map, must agree on: COLMAP's numbers (convention: as in COLMAP).

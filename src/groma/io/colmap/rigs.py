@@ -125,10 +125,7 @@ def camera_of(rigs: Sequence[RigDescription], name: str) -> RigCamera | None:
 
 
 def map_frames(
-    pycolmap: Any,
-    database: Path,
-    rigs: Sequence[RigDescription],
-    attempt: Callable[[Path], list[Any]],
+    pycolmap: Any, database: Path, rigs: Sequence[RigDescription], attempt: Callable[[Path], list[Any]]
 ) -> list[Any]:
     """Return the models of a database in which images are held by rigs.
 

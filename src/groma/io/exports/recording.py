@@ -108,11 +108,5 @@ def _log_images(rerun: Any, stream: Any, scene: Scene, images: DrawnCameras, shi
 
 
 register_format(
-    SceneFormat(
-        "rerun",
-        target=".rrd for rerun",
-        endings=(".rrd",),
-        write=write_recording,
-        check=check_recording,
-    )
+    SceneFormat("rerun", target=".rrd for rerun", endings=(".rrd",), write=write_recording, check=check_recording)
 )

@@ -161,9 +161,6 @@ def _from_principal_point(fixed: list[float], sizes: list[tuple[int, int]], rows
 
 register_format(
     SceneFormat(
-        "nvm",
-        source="a VisualSFM file (.nvm)",
-        recognise=lambda path, head: head.startswith(b"NVM_V3"),
-        read=read_nvm,
+        "nvm", source="a VisualSFM file (.nvm)", recognise=lambda path, head: head.startswith(b"NVM_V3"), read=read_nvm
     )
 )

@@ -199,10 +199,5 @@ def _recognise(path: Path, head: bytes) -> bool:
 
 
 register_format(
-    SceneFormat(
-        "openmvg",
-        source="an OpenMVG file (sfm_data.json)",
-        recognise=_recognise,
-        read=read_openmvg,
-    )
+    SceneFormat("openmvg", source="an OpenMVG file (sfm_data.json)", recognise=_recognise, read=read_openmvg)
 )

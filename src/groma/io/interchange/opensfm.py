@@ -243,10 +243,5 @@ def _recognise(path: Path, head: bytes) -> bool:
 
 
 register_format(
-    SceneFormat(
-        "opensfm",
-        source="an OpenSfM file (reconstruction.json)",
-        recognise=_recognise,
-        read=read_opensfm,
-    )
+    SceneFormat("opensfm", source="an OpenSfM file (reconstruction.json)", recognise=_recognise, read=read_opensfm)
 )

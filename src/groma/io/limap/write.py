@@ -10,15 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from groma.io.limap.files import (
-    NAMES,
-    SUFFIX,
-    Form,
-    Group2d,
-    Group3d,
-    Structures,
-    columns_of,
-)
+from groma.io.limap.files import NAMES, SUFFIX, Form, Group2d, Group3d, Structures, columns_of
 
 
 def write_files(structures: Structures, folder: Path, form: Form) -> None:

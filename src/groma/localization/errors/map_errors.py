@@ -63,9 +63,7 @@ def images_compared(count: int) -> IntArray:
 
 
 def shared_errors(
-    images: Sequence[SeenByImage],
-    progress: Callable[[int, int], None] | None = None,
-    gates: MapErrorGates = GATES,
+    images: Sequence[SeenByImage], progress: Callable[[int, int], None] | None = None, gates: MapErrorGates = GATES
 ) -> FloatArray:
     """Return (2,) what landmarks in one part of an image are off by together, radians as seen from it.
 

@@ -272,12 +272,7 @@ def pose_from_matches(
 
 
 def _unless_mirrored(
-    verdict: Verdict,
-    best: Refined,
-    own: Refined,
-    mirror: MirrorQuestions,
-    matches: Matches,
-    options: PoseOptions,
+    verdict: Verdict, best: Refined, own: Refined, mirror: MirrorQuestions, matches: Matches, options: PoseOptions
 ) -> Verdict:
     """Return a verdict, or another one where the mirror image of a photograph fits about as well, and by matches that
     are more alike.

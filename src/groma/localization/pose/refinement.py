@@ -275,11 +275,7 @@ def fitted(
 
 
 def fitted_at(
-    one: OnePose,
-    camera: QueryCamera,
-    matches: Matches,
-    max_error: tuple[float, float],
-    lens: FreeLens | None = None,
+    one: OnePose, camera: QueryCamera, matches: Matches, max_error: tuple[float, float], lens: FreeLens | None = None
 ) -> Refined:
     """Return what :func:`fitted` does, where the problem at the pose is known."""
     weights = weighed(one, matches)[0]

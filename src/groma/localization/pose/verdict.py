@@ -92,11 +92,7 @@ def evidence_of(refined: Refined, matches: Matches, places: int = 1) -> Evidence
 
 
 def judge(
-    refined: Refined,
-    covariance: FloatArray,
-    distance: float,
-    first: Evidence,
-    second: Evidence | None,
+    refined: Refined, covariance: FloatArray, distance: float, first: Evidence, second: Evidence | None
 ) -> Verdict:
     """Say whether a pose is right.
 

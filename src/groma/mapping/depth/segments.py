@@ -60,9 +60,7 @@ def segment_depths(
 
 
 def _depths_beside(
-    maps: DepthMaps,
-    noise: DepthNoise,
-    work: tuple[tuple[Path | None, tuple[int, int], Segments, FloatArray], float],
+    maps: DepthMaps, noise: DepthNoise, work: tuple[tuple[Path | None, tuple[int, int], Segments, FloatArray], float]
 ) -> FloatArray:
     """The same of one image (n, 5)."""
     (file, size, segments, pinhole), unit = work

@@ -39,13 +39,7 @@ from groma.mapping.noise.landmarks import LineNoise, line_noise
 from groma.scene import Scene
 
 #: The quantities, and the weight of each as ``benchmarks/line_confidence.py`` found it.
-WEIGHTS: dict[str, float] = {
-    "constant": 0.481,
-    "spread": 1.210,
-    "support": 1.363,
-    "length": 1.539,
-    "residual": -2.072,
-}
+WEIGHTS: dict[str, float] = {"constant": 0.481, "spread": 1.210, "support": 1.363, "length": 1.539, "residual": -2.072}
 
 
 @dataclass(frozen=True)

@@ -82,11 +82,7 @@ class LineViews:
 
 
 def build_views(
-    scene: Scene,
-    segments: Sequence[Segments],
-    min_length: float,
-    noise: float,
-    depth_margin: float,
+    scene: Scene, segments: Sequence[Segments], min_length: float, noise: float, depth_margin: float
 ) -> LineViews:
     """Undistort the segments of all images and find where to look for them in depth.
 
@@ -150,9 +146,7 @@ def views_of_rows(
 
 
 def _columns_of(
-    scene: Scene,
-    limits: tuple[float, float, float],
-    image: tuple[int, Segments, FloatArray, FloatArray],
+    scene: Scene, limits: tuple[float, float, float], image: tuple[int, Segments, FloatArray, FloatArray]
 ) -> dict[str, np.ndarray]:
     """Columns of one image: its number, segments, pinhole camera and points."""
     (min_length, noise, depth_margin), (i, segments, camera, points) = limits, image

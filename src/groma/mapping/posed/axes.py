@@ -110,10 +110,7 @@ def _best(values: FloatArray) -> FloatArray:
 def readings(rotation: FloatArray, centers: FloatArray) -> Iterator[Reading]:
     """Yield the other ways to read poses: inverse, cameras with other axes, mirrored, places with other axes."""
     inverse, moved = np.swapaxes(rotation, 1, 2), -np.einsum("nij,nj->ni", rotation, centers)
-    ways = (
-        (rotation, centers, ""),
-        (inverse, moved, "they are inverted (world to camera for camera to world) and "),
-    )
+    ways = ((rotation, centers, ""), (inverse, moved, "they are inverted (world to camera for camera to world) and "))
     for turned, places, words in ways:
         if words:
             yield Reading(words.removesuffix(" and "), turned, places)

@@ -97,11 +97,7 @@ class Angles:
 
 
 def angles_between(
-    planes: PlaneSet,
-    directions: DirectionSet,
-    lines: tuple[Pairs, Pairs],
-    vertical: Vector | None,
-    level: float,
+    planes: PlaneSet, directions: DirectionSet, lines: tuple[Pairs, Pairs], vertical: Vector | None, level: float
 ) -> dict[str, Pairs]:
     """Find relations between planes and directions, by their names; deviations are radians.
 

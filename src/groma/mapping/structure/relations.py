@@ -130,11 +130,7 @@ def spacings(points: FloatArray, segments: FloatArray) -> tuple[FloatArray, Floa
 
 
 def on_planes(
-    marks: Landmarks,
-    found: PlaneSet,
-    level: float,
-    least: tuple[float, float],
-    known: _Near | None = None,
+    marks: Landmarks, found: PlaneSet, level: float, least: tuple[float, float], known: _Near | None = None
 ) -> tuple[Pairs, Pairs]:
     """Points on planes and lines on planes; their probabilities have to exceed the least of their kind.
 

@@ -60,12 +60,7 @@ def search_for_loop(track_map: TrackMap, newest: Keyframe, gates: TrackingGates)
 
 
 def can_be(
-    track_map: TrackMap,
-    keyframe: Keyframe,
-    newest: Keyframe,
-    pose: FloatArray,
-    gates: LoopGates,
-    log_scale: float,
+    track_map: TrackMap, keyframe: Keyframe, newest: Keyframe, pose: FloatArray, gates: LoopGates, log_scale: float
 ) -> bool:
     """Whether errors that add up at random between two keyframes explain how far the newest is from a pose (7,).
 

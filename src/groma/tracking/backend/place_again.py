@@ -234,12 +234,7 @@ def _same_lines(
 
 
 def _scale(
-    older: KnownMap,
-    newer: KnownMap,
-    near: list[Keyframe],
-    newest: Keyframe,
-    pose: FloatArray,
-    gates: TrackingGates,
+    older: KnownMap, newer: KnownMap, near: list[Keyframe], newest: Keyframe, pose: FloatArray, gates: TrackingGates
 ) -> tuple[float, float] | None:
     """Return the logarithm of the scale of older lengths in terms of newer ones, and its variance."""
     seen = newest.measured.points

@@ -14,13 +14,7 @@ import numpy as np
 from groma.adjustment.graphs.similarity_graph import SimilarityGraphResult, SimilarityMotions, adjust_similarity_graph
 from groma.geometry import sim3
 from groma.solver.options import SolverOptions
-from groma.tracking.backend.loop_closure import (
-    can_be,
-    known_loops,
-    move,
-    neighbours,
-    search_for_loop,
-)
+from groma.tracking.backend.loop_closure import can_be, known_loops, move, neighbours, search_for_loop
 from groma.tracking.backend.place_again import KnownMap, PlaceAgain, join_place, measure_place
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.gates import LoopGates

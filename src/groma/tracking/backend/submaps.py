@@ -14,10 +14,7 @@ from groma.geometry import se3, sim3
 from groma.io.trajectories import Trajectory
 from groma.scene import Scene
 from groma.scene.landmarks import Lines
-from groma.tracking.backend.loop_closure import (
-    LoopSearch,
-    join_points,
-)
+from groma.tracking.backend.loop_closure import LoopSearch, join_points
 from groma.tracking.backend.place_again import KnownMap, measure_place
 from groma.tracking.frame.camera import TrackCamera, into, planes_into
 from groma.tracking.gates import TrackingGates

@@ -178,11 +178,7 @@ def small_image(gray: npt.NDArray[np.uint8], gates: TurnGates = DEFAULT.turns) -
 
 
 def turn_between(
-    camera: TrackCamera,
-    before: SmallImage,
-    now: SmallImage,
-    starts: list[FloatArray],
-    gates: TurnGates = DEFAULT.turns,
+    camera: TrackCamera, before: SmallImage, now: SmallImage, starts: list[FloatArray], gates: TurnGates = DEFAULT.turns
 ) -> FloatArray:
     """Return the rotation (3, 3) now_from_before that brings two small images to agree best.
 

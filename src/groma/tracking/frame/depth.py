@@ -23,11 +23,7 @@ def depth_sigma(depth: FloatArray, gates: DepthGates = DEFAULT.depth) -> FloatAr
 
 
 def segment_inverse_depths(
-    image: DepthImage,
-    ends: FloatArray,
-    pinhole: FloatArray,
-    noise: DepthNoise,
-    gates: DepthGates = DEFAULT.depth,
+    image: DepthImage, ends: FloatArray, pinhole: FloatArray, noise: DepthNoise, gates: DepthGates = DEFAULT.depth
 ) -> tuple[FloatArray, FloatArray]:
     """Inverse depths (L, 2) at the ends of segments and their standard deviations; NaN where unknown."""
     own = DepthLineGates(near=gates.near, far=gates.far, max_relative_sigma=1.0)

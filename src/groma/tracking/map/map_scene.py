@@ -132,9 +132,7 @@ def _point_tables(camera: TrackCamera, table: PointMeasurements, image: IntArray
 def _line_tables(table: LineMeasurements, image: IntArray) -> dict[str, object]:
     if not len(table):
         return {}
-    tables: dict[str, object] = {
-        "line_observations": LineObservations(image, table.index, table.ends, table.sigma),
-    }
+    tables: dict[str, object] = {"line_observations": LineObservations(image, table.index, table.ends, table.sigma)}
     rows = np.flatnonzero(np.isfinite(table.inverse_depth).all(axis=1))
     if len(rows):
         baseline = np.full(len(rows), DEPTH_BASELINE)

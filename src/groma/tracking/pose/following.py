@@ -192,11 +192,7 @@ def measure_lines(
     if few_points:
         inverse, sigma = data.inverse_depths(ends)
     return LineMeasurements(
-        segments.index[rows],
-        ends,
-        np.maximum(segments.sigma[rows], data.options.gates.lines.min_sigma),
-        inverse,
-        sigma,
+        segments.index[rows], ends, np.maximum(segments.sigma[rows], data.options.gates.lines.min_sigma), inverse, sigma
     )
 
 

@@ -119,11 +119,7 @@ def _relations(scene: Scene, kept: Kept) -> dict[str, str]:
     """Return relations as pairs of indices into the kept landmarks."""
     point, line = new_index_of(kept.points, scene.num_points), new_index_of(kept.lines, scene.num_lines)
     plane = np.arange(scene.num_planes)
-    ends = {
-        "line_on_plane": (line, plane),
-        "point_on_plane": (point, plane),
-        "point_on_line": (point, line),
-    }
+    ends = {"line_on_plane": (line, plane), "point_on_plane": (point, plane), "point_on_line": (point, line)}
 
     def packed(pairs: IntArray, first: IntArray, second: IntArray) -> str:
         found = np.column_stack([first[pairs[:, 0]], second[pairs[:, 1]]])

@@ -21,11 +21,7 @@ from groma.viz.viewer.server import Say, start_server, stop_server
 
 
 def open_viewer(
-    scene: Scene,
-    images: ImageFiles | None = None,
-    port: int = 8080,
-    host: str = "127.0.0.1",
-    say: Say | None = None,
+    scene: Scene, images: ImageFiles | None = None, port: int = 8080, host: str = "127.0.0.1", say: Say | None = None
 ) -> SceneView:
     """Serve a scene to the browser and return at once.
 

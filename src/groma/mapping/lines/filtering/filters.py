@@ -94,11 +94,7 @@ class SegmentKinds:
 
 
 def is_edge(
-    kinds: SegmentKinds,
-    line_of: IntArray,
-    seen: IntArray,
-    expected: IntArray,
-    options: MapLinesOptions,
+    kinds: SegmentKinds, line_of: IntArray, seen: IntArray, expected: IntArray, options: MapLinesOptions
 ) -> BoolArray:
     """(L,) lines of segments that are found again, and shown by those that should show them.
 

@@ -72,12 +72,7 @@ def repeatability(length: FloatArray, strength: FloatArray, eligible: BoolArray,
 
 
 def found_again(
-    length: FloatArray,
-    strength: FloatArray,
-    line_of: IntArray,
-    eligible: BoolArray,
-    num_lines: int,
-    least: float,
+    length: FloatArray, strength: FloatArray, line_of: IntArray, eligible: BoolArray, num_lines: int, least: float
 ) -> BoolArray:
     """Lines whose segments are of a kind that is found again.
 

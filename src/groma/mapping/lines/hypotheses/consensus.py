@@ -205,12 +205,7 @@ class Choice:
     supporters: IntArray
 
 
-def choose(
-    proposals: Proposals,
-    num_segments: int,
-    num_neighbors: int,
-    min_support: int,
-) -> Choice:
+def choose(proposals: Proposals, num_segments: int, num_neighbors: int, min_support: int) -> Choice:
     """Choose the place of each segment by the summed support of distinct neighbours."""
     neighbor, other = np.empty_like(proposals.neighbor), np.empty_like(proposals.other)
     values, pointers = np.empty_like(proposals.values), np.zeros(num_segments + 1, np.int64)

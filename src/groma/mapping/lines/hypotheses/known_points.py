@@ -136,11 +136,7 @@ def _propose(
 
 # ------------------------------------------------------------------------------------------------------------- Public
 def lines_through_points(
-    views: LineViews,
-    rows: slice,
-    ratios: FloatArray,
-    points: tuple[FloatArray, FloatArray],
-    slot: int,
+    views: LineViews, rows: slice, ratios: FloatArray, points: tuple[FloatArray, FloatArray], slot: int
 ) -> tuple[IntArray, FloatArray]:
     """Lines through known points on the segments of an image, as proposals.
 

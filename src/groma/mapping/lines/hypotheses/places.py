@@ -166,9 +166,7 @@ def _places_of(part: _Part) -> list[Places]:
 
 
 def _places_in(
-    proposer: Proposer,
-    matches: Mapping[tuple[int, int], LineMatches] | MatchProvider | None,
-    image: _Image,
+    proposer: Proposer, matches: Mapping[tuple[int, int], LineMatches] | MatchProvider | None, image: _Image
 ) -> Places:
     """The same of one image."""
     views, (i, others, points, known) = proposer.views, image
