@@ -52,8 +52,8 @@ def follow_frame(
     """Return the pose of a frame that follows another, and what is still followed.
 
     ``expected`` is the predicted pose with its standard deviations (6,). Lines and planes are found beside points in a
-    pool. Where so few points are left that features will be asked anyway, lines are not followed; they do not begin
-    before points if the frame before was ``searched``.
+    pool. Where so many points are gone that features will be asked anyway, lines are not followed, unless few are left:
+    without lines their pose is a poor guess. Lines do not begin before points if the frame before was ``searched``.
     """
     camera, options, gates = data.camera, data.options, data.options.gates
     predicted, prior_sigma = expected
@@ -80,11 +80,16 @@ def follow_frame(
             planes = match_planes(track_map, data, predicted, gates.planes.wide_angle, gates.planes.wide_distance)
     with watch("lines"):
         lines = LineMeasurements.empty()
-        if options.points and misses_much(track_map, camera, followed.points, predicted, len(measured), gates):
+        few = len(measured) < gates.lines.few_points
+        if (
+            options.points
+            and not few
+            and misses_much(track_map, camera, followed.points, predicted, len(measured), gates)
+        ):
             segments = FollowedSegments.empty()
         elif with_lines:
             segments = lines_followed()
-            lines = measure_lines(track_map, data, segments, few_points=len(measured) < gates.lines.few_points)
+            lines = measure_lines(track_map, data, segments, few_points=few)
     if len(measured) + 2 * len(lines) + 3 * len(planes) < gates.verification.min_followed:
         return None, Followed.nothing()
     with watch("pose"):
