@@ -8,8 +8,6 @@ import sys
 import numba
 import numpy as np
 import pytest
-from numba.core.runtime import _nrt_python
-from numba.core.runtime.nrt import rtsys
 
 from groma._numba import loop
 
@@ -221,73 +219,3 @@ def test_ranges_are_those_of_python(kind):
 def test_ranges_in_ranges():
     for count in range(7):
         assert _nested(count) == _nested.py_func(count)
-
-
-@loop
-def _give_back(array):
-    return array
-
-
-@loop
-def _give_back_part(array, index):
-    part = array[index]
-    other = part
-    return other, array[0]
-
-
-@loop
-def _last_part(array):
-    for n in range(len(array)):
-        part = array[n]
-        part[0] += 1.0
-    array = array[1:]
-    return array[0], part
-
-
-@loop
-def _exchanged(first, second, count):
-    for _ in range(count):
-        first, second = second, first
-    return first, second[0]
-
-
-@loop
-def _perhaps_another(array, is_new):
-    if is_new:
-        array = np.zeros(array.shape)
-    return array[0]
-
-
-@pytest.fixture
-def _counted_memory():
-    _nrt_python.memsys_enable_stats()
-    yield
-    _nrt_python.memsys_disable_stats()
-
-
-@pytest.mark.usefixtures("_counted_memory")
-@pytest.mark.parametrize(
-    ("function", "more"),
-    [(_give_back, ()), (_give_back_part, (1,)), (_last_part, ()), (_exchanged, (np.ones((2, 3)), 3)),
-     (_perhaps_another, (True,)), (_perhaps_another, (False,))],
-)  # fmt: skip
-def test_references_to_arguments_and_their_parts_are_counted_right(function, more):
-    function(np.ones((3, 4)), *more)  # what compiling keeps
-    array = np.ones((3, 4))
-    arrays = [array, *(item for item in more if isinstance(item, np.ndarray))]
-    before = [sys.getrefcount(one) for one in arrays], rtsys.get_allocation_stats()
-    found = function(array, *more)
-    again = function.py_func(np.ones((3, 4)), *more)
-    for one, other in zip(*((item if isinstance(item, tuple) else (item,)) for item in (found, again)), strict=True):
-        assert one.tolist() == other.tolist()
-    del found, again, one, other
-    after = rtsys.get_allocation_stats()
-    assert [sys.getrefcount(one) for one in arrays] == before[0]
-    assert after.alloc - before[1].alloc == after.free - before[1].free
-
-
-def test_parts_outlive_the_argument():
-    array = np.arange(12.0).reshape(3, 4)
-    part, _ = _give_back_part(array, 1)
-    del array
-    assert part.tolist() == [4.0, 5.0, 6.0, 7.0]

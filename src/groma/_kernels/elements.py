@@ -17,7 +17,7 @@ from functools import cache, cached_property
 from typing import Any
 
 from llvmlite import ir as llvm
-from numba.core import cgutils, ir, types
+from numba.core import cgutils, types
 from numba.core.compiler_machinery import register_pass
 from numba.core.debuginfo import DummyDIBuilder
 from numba.core.lowering import Lower
@@ -29,7 +29,6 @@ _ZERO, _HALF = llvm.Constant(_WORD, 0), llvm.IntType(32)
 _DATA, _SHAPE, _STRIDES = 4, 5, 6
 #: What a loop over a range is made of, and numbers of arrays by fixed indices.
 _PARTS = {"pair_first": 0, "pair_second": 1}
-_PART = ("getitem", "static_getitem")
 _COUNTING = ("static_getitem", "call", "getiter", "iternext", *_PARTS)
 
 
@@ -51,11 +50,6 @@ def _item(value: Any, place: int) -> Any:
     return None
 
 
-def _is_view(array: Any, kinds: Any, found: Any) -> bool:
-    """Whether what is found is what is left of an array by its first indices."""
-    return type(found) is types.Array and found.ndim == array.ndim - len(kinds)
-
-
 @cache
 def _is_counted(models: Any, kind: Any) -> bool:
     return models[kind].contains_nrt_meminfo()
@@ -63,9 +57,6 @@ def _is_counted(models: Any, kind: Any) -> bool:
 
 class _Lower(Lower):
     """Numba's, with short code for numbers of arrays and for variables without a count of references."""
-
-    #: Whether references are counted: not where something borrowed is assigned.
-    _counts = True
 
     @cached_property
     def _is_plain(self) -> bool:
@@ -76,51 +67,9 @@ class _Lower(Lower):
         """Whether something of a type has a count of references."""
         return _is_counted(self.context.data_model_manager, kind)
 
-    @cached_property
-    def _borrowed(self) -> set[str]:
-        """Names of variables that stand for arguments or parts of them: the caller holds those, so none are counted."""
-        values: dict[str, list[Any]] = {}
-        for block in self.blocks.values() if self._is_plain and not self.func_ir.is_generator else ():
-            for statement in block.find_insts(ir.Assign):
-                values.setdefault(statement.target.name, []).append(statement.value)
-        single = {name: found[0] for name, found in values.items() if len(found) == 1 and self._is_counted_type(name)}
-        borrowed: set[str] = set()
-        while more := {name for name, value in single.items() if name not in borrowed and self._is_of(value, borrowed)}:
-            borrowed |= more
-        return borrowed
-
-    def _is_of(self, value: Any, borrowed: set[str]) -> bool:
-        """Whether a value is an argument, or one of some variables, or a part of it."""
-        if isinstance(value, ir.Arg):
-            return not isinstance(self.typeof(f"arg.{value.name}"), types.Omitted)
-        if isinstance(value, ir.Var):
-            return value.name in borrowed
-        if not isinstance(value, ir.Expr) or value.op not in _PART or value.value.name not in borrowed:
-            return False
-        index = value.index if value.op == "getitem" else value.index_var
-        array = self.typeof(value.value.name)
-        found = getattr(self.fndesc.calltypes.get(value), "return_type", None)  # tuples have none
-        kinds = None if index is None else self._kinds(array, index)
-        return kinds is not None and _is_view(array, kinds, found)
-
-    def _is_counted_type(self, name: str) -> bool:
-        return self._is_counted(self.typeof(name))
-
-    def _is_held(self, name: str) -> bool:
-        """Whether a variable holds a counted reference."""
-        return self._is_counted_type(name) and name not in self._borrowed
-
-    def lower_assign(self, ty: Any, inst: Any) -> Any:
-        """Return what is assigned; what is borrowed is not counted."""
-        self._counts = inst.target.name not in self._borrowed
-        try:
-            return super().lower_assign(ty, inst)
-        finally:
-            self._counts = True
-
     def incref(self, typ: Any, val: Any) -> None:
         """Count a reference, where there is something to be counted."""
-        if self._counts and self._is_counted(typ):
+        if self._is_counted(typ):
             super().incref(typ, val)
 
     def decref(self, typ: Any, val: Any) -> None:
@@ -131,7 +80,7 @@ class _Lower(Lower):
     def storevar(self, value: Any, name: str, argidx: int | None = None) -> None:
         """Store a number without reading what was there before."""
         kind = self.typeof(name)
-        if not self._is_plain or (argidx is None and self._is_held(name)):
+        if not self._is_plain or (argidx is None and self._is_counted(kind)):
             super().storevar(value, name, argidx)
             return
         self._alloca_var(name, kind)
@@ -142,7 +91,7 @@ class _Lower(Lower):
 
     def delvar(self, name: str) -> None:
         """Forget an array; a number may stay where it is."""
-        if self._is_held(name):
+        if self._is_counted(self.typeof(name)):
             super().delvar(name)
         elif name not in self._blk_local_varmap:
             self._singly_assigned_vars.discard(name)
@@ -229,7 +178,7 @@ class _Lower(Lower):
         """Read one number, or name a part of an array by its first indices."""
         array = self.typeof(value.name)
         kinds, found = self._kinds(array, index), signature.return_type
-        if kinds is not None and _is_view(array, kinds, found):
+        if kinds is not None and type(found) is types.Array and found.ndim == array.ndim - len(kinds):
             part = self._view(value.name, array, index.name, kinds)
             self.incref(found, part)
             return self.context.cast(self.builder, part, found, resty)
