@@ -58,8 +58,9 @@ def gate(default: Any, unit: str, meaning: str, origin: str) -> Any:
 
 @dataclass(frozen=True)
 class NormalGates:
-    """Where what normal noise explains ends: levels that tests of all rooms share."""
+    """Where what normal noise explains ends, and most begins: levels that tests of all rooms share."""
 
+    alike: float = gate(2.0, "sigma", "of a difference that noise often makes", "derived from normal noise: 1 in 22")
     far: float = gate(3.0, "sigma", "of a difference that noise seldom makes", "derived from normal noise: 1 in 370")
     coordinate: float = gate(3.5, "sigma", "of a coordinate that disagrees", "derived from normal noise: 1 in 2 000")
     mistake: float = gate(4.0, "sigma", "of a difference that is a mistake", "derived from normal noise: 1 in 16 000")
@@ -67,6 +68,10 @@ class NormalGates:
     outlier: float = gate(3e-3, "probability", "of a residual that noise exceeds", "convention: three sigma")
     gross: float = gate(1e-3, "probability", "of calling a good measurement wrong", "convention: Baarda")
     false_alarm: float = gate(0.01, "probability", "of an error found where there is none", "convention: 1 in 100")
+    significance: float = gate(0.05, "probability", "of an effect found where there is none", "convention: 1 in 20")
+    never: float = gate(1e-4, "probability", "of what is taken to be impossible", "convention: 1 in 10 000")
+    majority: float = gate(0.5, "share", "above which it is most of them", "convention: more than half")
+    sample: int = gate(100, "values", "whose scatter tells their noise", "derived from normal noise: good to 7 %")
 
 
 NORMAL = NormalGates()

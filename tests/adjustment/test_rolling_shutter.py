@@ -2,6 +2,7 @@
 """Images read row by row: poses and motions against exact truth, with points and lines; what is told; the archive."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from groma.adjustment.terms import readout
 from groma.cli.main import run
 from groma.errors import FileFormatError, InputError
 from groma.evaluation import evaluate_poses
+from groma.gates import NORMAL
 from groma.io import read_scene, write_scene
 from groma.scene import CameraMotions, PointDepths, Similarity, synthetic
 
@@ -88,7 +90,7 @@ def test_noise_of_rows_does_not_bias_motions(monkeypatch):
         return np.degrees(np.abs((found.camera_motions.motion[:, 3:] - motions[:, 3:]).mean(axis=0))).max()
 
     predicted = bias()
-    monkeypatch.setattr(readout, "GATES", readout.ReadoutGates(near=0.0))
+    monkeypatch.setattr(readout, "NORMAL", replace(NORMAL, mistake=0.0))
     assert bias() > 4.0 * predicted  # where a row counts as observed
 
 

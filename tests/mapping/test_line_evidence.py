@@ -8,13 +8,13 @@ import pytest
 from _wireframe import arc, random_lines, wireframe
 from scipy.special import logit
 
-from groma.mapping.lines.filtering.filters import FilterGates
+from groma.gates import NORMAL
 from groma.mapping.lines.filtering.texture import TextureGates, _cost, _minimum, edge_odds, num_expected
 from groma.mapping.lines.linking.tracks import Tracks
 from groma.mapping.lines.views import build_views
 
 EDGE, TEXTURE = TextureGates().edge, TextureGates().texture
-TEXTURE_ODDS = logit(FilterGates().min_edge_probability)
+TEXTURE_ODDS = logit(NORMAL.significance)
 
 
 def population(rng, count, rate, length, leftover, expected=12):

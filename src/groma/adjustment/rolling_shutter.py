@@ -64,7 +64,6 @@ class RollingShutterGates:
     explained: float = gate(
         0.1, "share", "of the residuals' variance that motions explain, or they are left out", "convention: a tenth"
     )
-    determined: float = gate(0.5, "share", "of a motion that images determine, else a warning", "convention: half")
 
 
 GATES = RollingShutterGates()
@@ -117,7 +116,7 @@ class Motions:
             )
         for name, part in (("shifts", slice(0, 3)), ("turns", slice(3, 6))):
             share = float(self.redundancy[:, part].mean())
-            if share < GATES.determined:
+            if share < NORMAL.majority:
                 told.append(
                     f"The {name} of the cameras during the readout rest by {1.0 - share:.0%} on what is expected of "
                     "them, not on the images."

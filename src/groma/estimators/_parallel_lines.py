@@ -63,7 +63,6 @@ class ParallelGates:
     max_candidates: int = gate(256, "directions", "candidates of one round", "cost: time of a search")
     max_refined: int = gate(3, "directions", "best candidates that are refined", "cost: time of a search")
     rounds: int = gate(15, "rounds", "of expectation and maximisation", "cost: converges in fewer")
-    same: float = gate(3.0, "parallel sigmas", "nearer directions are one", "derived from normal noise: 1 in 370")
 
     @property
     def deviations(self) -> FloatArray:

@@ -21,6 +21,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators._plane_loops import BALL, height_kernel, least_axis_kernel, lies_on_kernel, variance_kernel
 from groma.estimators._plane_options import PLANE_SEARCH
 from groma.execution import map_in_threads, map_ranges
+from groma.gates import NORMAL
 from groma.geometry.algebra import cross, dot, norm
 
 #: Pairs processed together (cost: memory).
@@ -383,7 +384,7 @@ class Scores:
         """Take candidates that would end at a plane, on some features, off those that are worth a try (H,)."""
         if len(rows):
             keep_others_loop(
-                self._features.arrays, rows, plane, self._planes, PLANE_SEARCH.same, self._first_at, self._at,
+                self._features.arrays, rows, plane, self._planes, NORMAL.alike, self._first_at, self._at,
                 self._mark, alive,
             )  # fmt: skip
 

@@ -28,6 +28,7 @@ from groma.estimators._plane_options import PLANE_SEARCH as GATES
 from groma.estimators._plane_options import PlaneOptions
 from groma.estimators.association import MAX_SQUARE, ROUNDS, log10_binomial_tail
 from groma.estimators.plane_fit import PlaneFit, fit_with_covariance
+from groma.gates import NORMAL
 from groma.geometry.algebra import norm
 
 
@@ -215,7 +216,7 @@ class Grower:
             options.max_tilt, features.rough, GATES.rank, GATES.grow_steps, GATES.fit_rounds,
         )  # fmt: skip
         least = GATES.hopeless * options.min_share
-        self._polishing = GATES.link, GATES.inlier, least, ROUNDS, GATES.polish_steps, GATES.fit_rounds
+        self._polishing = GATES.link, NORMAL.far, least, ROUNDS, GATES.polish_steps, GATES.fit_rounds
 
     def grow(self, plane: FloatArray, home: int, labels: IntArray) -> Growth:
         """Refine a candidate where it is connected, and test it: its rows, the refined plane, its support.
@@ -250,7 +251,7 @@ class Grower:
             even += self._log_tried
         if max(alarm, even) > np.log10(options.max_false_alarms):
             return None, plane, rows
-        if features.rough and np.mean(labels[layer[np.abs(height) < reach]] < 0) <= GATES.own:
+        if features.rough and np.mean(labels[layer[np.abs(height) < reach]] < 0) <= NORMAL.majority:
             return None, plane, rows
         fit = fit_with_covariance(plane, center, features.places[layer], precision, weight)
         # The whole layer is taken out: relief so near cannot be distinguished from the plane.

@@ -37,9 +37,6 @@ class PlaneSearchGates:
         4.0, "1", "by which the noise of features grows where rough walls are searched",
         "derived from the layer: planes four times as rough as the noise stand out in it",
     )  # fmt: skip
-    own: float = gate(
-        0.5, "share", "of what lies on a rough plane that lies on none found before", "convention: more than half"
-    )
     neighbours: int = gate(32, "features", "neighbours that make a candidate, and that improve it", _SURVEYED)
     rank: int = gate(8, "features", "the neighbour whose distance is the spacing", _SURVEYED)
     features_per_seed: int = gate(
@@ -66,9 +63,6 @@ class PlaneSearchGates:
     converged: float = gate(0.1, "sigma", "growth ends when no feature moves by more", "cost: a tenth of the noise")
     band: float = gate(8.0, "sigma", "half thickness of the layer in which a plane must stand out", _SURVEYED)
     polish_steps: int = gate(3, "rounds", "rounds with the probability of membership as the weight", _SURVEYED)
-    inlier: float = gate(
-        3.0, "sigma", "features of a layer within have a weight", "derived from normal noise: 1 in 370"
-    )
     hopeless: float = gate(
         0.5, "share", "of the least share; a plane below is given up early", "cost: time of a search"
     )
@@ -79,9 +73,6 @@ class PlaneSearchGates:
     refined: float = gate(10.0, "planes", "planes that a refined candidate stands for", "derived from its rounds")
     patience: int = gate(100, "candidates", "failures in a row that end the search", "cost: time of a search")
     candidates_per_failure: int = gate(64, "candidates", "candidates for one more failure", "cost: time of a search")
-    same: float = gate(
-        2.0, "sigma", "a candidate within is a plane that was tried", "derived from normal noise: 1 in 22"
-    )
 
 
 #: The numbers in use.

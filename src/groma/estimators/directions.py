@@ -31,7 +31,7 @@ from groma.errors import InputError, ShapeError
 from groma.estimators._direction_features import Perpendicular, crossings
 from groma.estimators._parallel_lines import PARALLEL, Acceptance, parallel_lines
 from groma.estimators.association import log10_poisson_tail
-from groma.gates import chi_square_gate, gate
+from groma.gates import NORMAL, chi_square_gate, gate
 from groma.geometry.algebra import dot, unit, vectors
 
 
@@ -44,14 +44,11 @@ class DirectionGates:
     max_scored: int = gate(4096, "features", "features that score them", "cost: time of a search")
     max_refined: int = gate(3, "directions", "best candidates that are refined", "cost: time of a search")
     min_sine: float = gate(0.02, "rad", "of two normals that make a candidate", "derived from noise of 0.05 degrees")
-    taken: float = gate(0.9999, "probability", "within which features go with a direction", "derived from noise")
     wider: float = gate(4.0, "1", "factor of the squared gate in the refinement", "chosen on synthetic rooms")
     max_move: float = gate(0.05, "rad", "longest step of the refinement", "derived from linearity")
-    same: float = gate(3.0, "parallel sigmas", "nearer directions are one", "derived from normal noise: 1 in 370")
     orthogonal_sigma: float = gate(
         2.6e-3, "rad", "of right angles", "derived from parallel ones, times three: 0.15 degrees"
     )
-    orthogonal_level: float = gate(0.95, "probability", "level of the test of a right angle", "convention: 95 %")
     max_orthogonal_sigma: float = gate(0.01, "rad", "of right angles that tell something", "chosen on synthetic rooms")
 
 
@@ -182,7 +179,7 @@ def directions_from_lines(
         )
     _check_finite(directions, covariance)
     sigma, bound = options.parallel_sigma, options.max_false_alarms
-    apart = PARALLEL.same * sigma
+    apart = NORMAL.far * sigma
     wanted = Acceptance(options.min_coincidences + 1, options.max_directions, options.max_sigma, apart, bound)
     found = parallel_lines(unit(directions), covariance, sigma, turned, wanted)
     agrees = (found.probability > 0.5) & (found.squared < PARALLEL.quantile(options.level))
@@ -192,7 +189,7 @@ def directions_from_lines(
         np.bincount(found.label[agrees], minlength=len(found.vectors)),
         -found.evidence / np.log(10.0),
         np.where(agrees, found.label, -1),
-        orthogonal_pairs(found.vectors, found.covariance, DIRECTIONS.same * sigma),
+        orthogonal_pairs(found.vectors, found.covariance, NORMAL.far * sigma),
         found.probability,
         found.deviation,
     )
@@ -224,7 +221,7 @@ def orthogonal_pairs(
     cosine = dot(directions[first], directions[second])
     variance = np.einsum("mi,mij,mj->m", directions[first], covariance[second], directions[first])
     variance += np.einsum("mi,mij,mj->m", directions[second], covariance[first], directions[second])
-    passed = cosine**2 < chi_square_gate(1.0 - DIRECTIONS.orthogonal_level, 1) * (variance + sigma**2)
+    passed = cosine**2 < chi_square_gate(NORMAL.significance, 1) * (variance + sigma**2)
     passed &= variance < DIRECTIONS.max_orthogonal_sigma**2
     return np.column_stack([first, second])[passed]
 
@@ -240,7 +237,7 @@ def _search(features: Perpendicular, options: DirectionOptions) -> DirectionSet:
     rng = np.random.default_rng(options.seed)
     gate = chi_square_gate(1.0 - options.level, 1)
     # Features up to the 10^-4 quantile are taken out, too, so that the rest does not repeat the direction.
-    wide = chi_square_gate(1.0 - DIRECTIONS.taken, 1)
+    wide = chi_square_gate(NORMAL.never, 1)
     tried = max(len(features), 2) ** 2
     remaining = np.arange(len(features))
     found: list[FloatArray] = []
@@ -266,9 +263,7 @@ def _search(features: Perpendicular, options: DirectionOptions) -> DirectionSet:
             tail = log10_poisson_tail(count - 1, expected) + np.log10(tried)
             certain = float(np.linalg.eigvalsh(covariance)[-1]) < options.max_sigma**2
             strong = tail < np.log10(options.max_false_alarms) and count >= least
-            new = all(
-                abs(float(direction @ other)) < np.cos(DIRECTIONS.same * options.parallel_sigma) for other in found
-            )
+            new = all(abs(float(direction @ other)) < np.cos(NORMAL.far * options.parallel_sigma) for other in found)
             if strong and certain and new:
                 accepted = direction, covariance, tail
                 break
@@ -300,7 +295,7 @@ def _collect(
     agrees = squared.min(axis=0) < gate
     label[agrees] = nearest[agrees]
     support = np.bincount(label[agrees], minlength=len(found))
-    pairs = orthogonal_pairs(directions, covariance, DIRECTIONS.same * options.parallel_sigma)
+    pairs = orthogonal_pairs(directions, covariance, NORMAL.far * options.parallel_sigma)
     return DirectionSet(directions, covariance, support, np.array(alarms), label, pairs)
 
 

@@ -26,7 +26,7 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.association import MAX_SQUARE, maximise_shares
 from groma.execution import map_in_threads
-from groma.gates import chi_square_gate, gate
+from groma.gates import NORMAL, chi_square_gate, gate
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,6 @@ class MembershipGates:
     pooled: float = gate(4.0, "features", "that the overall share counts in each", "chosen on walls full of points")
     tried: int = gate(12, "deviations", "that are tried", "cost: each two fifths larger than the one before")
     least: float = gate(0.02, "share", "of the largest deviation, the least that is tried", "cost: tells from none")
-    significance: float = gate(0.05, "probability", "to find a deviation where there is none", "convention: 5 %")
 
 
 #: The numbers in use.
@@ -90,7 +89,7 @@ def memberships(found: Candidates, most: FloatArray) -> Membership:
     best = likelihood.argmax(axis=0)
     gain = likelihood.max(axis=0) - likelihood[0]
     # Where the widest fits best nothing stands out from clutter, whatever it is.
-    best[(gain < 0.5 * chi_square_gate(MEMBERSHIPS.significance, 1)) | (best == len(tried) - 1)] = 0
+    best[(gain < 0.5 * chi_square_gate(NORMAL.significance, 1)) | (best == len(tried) - 1)] = 0
     deviation = tried[best, np.arange(num)]
     share = shares[best[found.owner], found.group]
     return Membership(_probability(found, deviation, share), deviation)

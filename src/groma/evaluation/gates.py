@@ -20,7 +20,6 @@ class ScoreGates:
         "convention: LIMAP gives 1, 5 and 10 mm in rooms of a metre and more",
     )  # fmt: skip
     strict_share: float = gate(0.9, "share", "of a line that is near, for strict precision", "convention: nearly all")
-    found_share: float = gate(0.5, "share", "of a segment that is near, for the recall by count", "convention: half")
     max_anchors: int = gate(200_000, "places", "places on a reference that distances are sought from", "cost: memory")
     max_places: int = gate(1000, "places", "places on one segment", "cost: memory")
     plane_angle_deg: float = gate(10.0, "deg", "angle of planes that are the same", "convention: of plane benchmarks")
@@ -29,7 +28,6 @@ class ScoreGates:
         (1.0, 3.0, 5.0, 10.0), "deg", "thresholds of the area under the curve", "convention: image matching benchmarks"
     )
     time_difference: float = gate(0.01, "s", "times of poses that belong together", "convention: half of TUM's 0.02 s")
-    associated: float = gate(0.5, "share", "less of the shorter side in both is warned of", "convention: half")
     but_for_scale: float = gate(
         0.25, "share", "of the error left by a free scale, to be told", "convention: 15/16 of squares"
     )

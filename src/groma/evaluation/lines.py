@@ -42,6 +42,7 @@ from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
 from groma.evaluation.gates import SCORES
 from groma.evaluation.poses import as_numbers, evaluate_poses
+from groma.gates import NORMAL
 from groma.geometry.algebra import finite_rows
 from groma.io.geometry import Geometry
 from groma.scene import Scene
@@ -112,7 +113,7 @@ def score_lines(
     if len(truth) == len(target):  # segments only
         back, true_length = _near(truth, step, taus, Distances(Geometry(segments=estimate), min(taus), *needed))
         reference_length = float(true_length.sum())
-        covered, halves = (back * true_length[:, None]).sum(0), (back >= SCORES.found_share).mean(0)
+        covered, halves = (back * true_length[:, None]).sum(0), (back >= NORMAL.majority).mean(0)
     else:
         reference_length, covered, halves = np.nan, np.full(len(taus), np.nan), np.full(len(taus), np.nan)
     inlier = (forth * length[:, None]).sum(0)

@@ -14,6 +14,7 @@ from groma._typing import FloatArray
 from groma.errors import InputError
 from groma.evaluation.alignment import align_poses, camera_centers
 from groma.evaluation.gates import SCORES
+from groma.gates import NORMAL
 from groma.geometry import quaternion
 from groma.scene import Scene, Similarity
 from groma.scene.checks import check_scene_given
@@ -97,7 +98,7 @@ def evaluate_poses(estimate: Scene, reference: Scene) -> PoseScores:
     scores = score_poses(estimated, true, num_missing=reference.num_images - len(common))
     scores = replace(scores, warnings=(*tell_partly(found, wanted, known, "reference"), *scores.warnings))
     least = min(scene.num_images for scene in (estimate, reference))
-    if len(common) >= SCORES.associated * least:
+    if len(common) >= NORMAL.majority * least:
         return scores
     few = (
         f"Only {len(common):,} of {estimate.num_images:,} and {reference.num_images:,} images have a name that is in "

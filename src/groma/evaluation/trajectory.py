@@ -29,6 +29,7 @@ from groma.errors import InputError, check_kind
 from groma.evaluation.alignment import pose_alignment
 from groma.evaluation.gates import SCORES
 from groma.evaluation.poses import rotation_angle, unrelated
+from groma.gates import NORMAL
 from groma.geometry import quaternion, se3
 from groma.io.trajectories import Trajectory
 from groma.scene import Similarity
@@ -297,7 +298,7 @@ def _no_match(estimate: Trajectory, reference: Trajectory, limit: float) -> str:
 
 def _few_in_common(estimate: Trajectory, reference: Trajectory, count: int) -> str | None:
     """Return a sentence where fewer poses are associated than should be."""
-    if count >= SCORES.associated * min(len(estimate), len(reference)):
+    if count >= NORMAL.majority * min(len(estimate), len(reference)):
         return None
     numbered = [name for name, side in (("EST", estimate), ("REF", reference)) if counts_lines(side)]
     hint = "check the units of time, or allow a larger difference"

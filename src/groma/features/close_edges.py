@@ -28,7 +28,7 @@ from groma.features.edge_fit import EDGES
 from groma.features.images import GrayImage, to_gray
 from groma.features.segments import Segments
 from groma.features.steps import beside, fit, profiles, two_steps
-from groma.gates import chi_square_gate, gate
+from groma.gates import NORMAL, chi_square_gate, gate
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,6 @@ class CloseEdgeGates:
     displacement: float = gate(
         0.35, "px", "by which neighbours still displace one step", "derived from edges one to three pixels apart"
     )
-    chance: float = gate(1e-4, "probability", "that noise looks like another step", "convention: 1 in 10 000")
 
 
 #: The defaults.
@@ -166,7 +165,7 @@ class _Profiles:
         gates, weight, log_blur = self.gates, self._weight(self.whole), math.log(self.gates.blur)
         # No second step could gain more than all that is left.
         # A step has three unknowns; twelve bins less two steps leave six.
-        evidence, misfit = chi_square_gate(gates.chance, 3), chi_square_gate(gates.chance, 6)
+        evidence, misfit = chi_square_gate(NORMAL.never, 3), chi_square_gate(NORMAL.never, 6)
         some = np.flatnonzero(alone > evidence)
         start, found = two_steps(self.whole[some], weight[some], log_blur, EDGES.max_shift)
         some = some[found]

@@ -41,7 +41,7 @@ from groma._numba import inline_kernel, kernel, loop
 from groma._ordering import median
 from groma._typing import FloatArray
 from groma.features.images import GrayImage
-from groma.gates import gate, numbers
+from groma.gates import NORMAL, gate, numbers
 
 #: A grey image (H, W), smoothed.
 SmoothImage = npt.NDArray[np.float32]
@@ -49,6 +49,8 @@ SmoothImage = npt.NDArray[np.float32]
 #: Samples across the segment reach this far on either side, pixels: the size of an array.
 REACH = 3
 SAMPLES = 2 * REACH + 1
+#: Square of a bow, over its variance, from which on it counts.
+_BOW = NORMAL.far**2
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,6 @@ class EdgeGates:
     unfitted_sigma: float = gate(0.5, "px", "segments that could not be fitted", "derived from the detector's pixels")
     prior_sigma: float = gate(0.15, "px", "noise of one sample, before any is seen", "chosen on Strecha's scenes")
     prior_count: float = gate(10.0, "samples", "samples that this weighs", "chosen on Strecha's scenes")
-    bow_test: float = gate(9.0, "sigma squared", "a bow counts from here", "derived from normal noise: 1 in 370")
     outlier: float = gate(4.0, "sigma", "samples farther off weigh nothing", "derived from Tukey's 95 % efficiency")
     min_share: float = gate(0.5, "share", "of the samples that show an edge", "derived from the median it starts from")
 
@@ -183,7 +184,7 @@ def _robust_line(s, e, w, spread, n, outlier, line):
 @inline_kernel
 def _end_sigma(s, e, w, n, line, numbers):
     """Standard deviation of the ends across the segment, from residuals, their correlation and their bow."""
-    min_sigma, prior_sigma, prior_count, bow_test = numbers
+    min_sigma, prior_sigma, prior_count = numbers
     weight, squares, lagged, before = 0.0, 0.0, 0.0, 0.0
     bow, bows = 0.0, 0.0
     for k in range(n):
@@ -200,7 +201,7 @@ def _end_sigma(s, e, w, n, line, numbers):
     rho = min(max(lagged / max(squares, 1e-12), 0.0), 0.9)
     effective = max(weight * (1.0 - rho) / (1.0 + rho), 2.0)
     bow /= max(bows, 1e-12)
-    if bow * bow * bows < bow_test * variance * (weight / effective):
+    if bow * bow * bows < _BOW * variance * (weight / effective):
         bow = 0.0
     return math.sqrt(min_sigma**2 + 4.0 * variance / effective + (bow / 6.0) ** 2)
 
@@ -208,7 +209,7 @@ def _end_sigma(s, e, w, n, line, numbers):
 @loop
 def _measure_all(image, ends, fit, gates, new_ends, sigma, strength):
     """Direct, fit and rate all segments; `image` is float32, smoothed, `gates` the numbers of :class:`EdgeGates`."""
-    window, max_shift, min_sigma, unfitted_sigma, prior_sigma, prior_count, bow_test, outlier, min_share = gates
+    window, max_shift, min_sigma, unfitted_sigma, prior_sigma, prior_count, outlier, min_share = gates
     profile, mean = np.zeros(SAMPLES), np.zeros(SAMPLES)
     line = np.zeros(2)
     for row in range(ends.shape[0]):
@@ -247,7 +248,7 @@ def _measure_all(image, ends, fit, gates, new_ends, sigma, strength):
         new_ends[row, 0], new_ends[row, 1] = u1 - dy * first, v1 + dx * first
         new_ends[row, 2], new_ends[row, 3] = u2 - dy * second, v2 + dx * second
         share = _kept_share(mean, line[0], window)
-        noise = _end_sigma(s, e, w, n, line, (min_sigma, prior_sigma, prior_count, bow_test))
+        noise = _end_sigma(s, e, w, n, line, (min_sigma, prior_sigma, prior_count))
         sigma[row] = math.hypot(noise, share / (1.0 - share) * max(abs(first), abs(second)))
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.gates import NORMAL
 from groma.localization.landmarks import counted_in
 from groma.localization.map_index import MapIndex
 from groma.localization.pose.camera import QueryCamera
@@ -114,13 +115,13 @@ def shown_of(
 def _often_alone(rate: FloatArray, found: BoolArray, unique: BoolArray, least: float) -> float:
     """How often unique points are found, as a share of how often all are; one where hardly any are expected.
 
-    It is the lower limit of the mean of a Poisson variable, at ``VERDICT.often`` (Garwood 1936).
+    It is the lower limit of the mean of a Poisson variable, at ``NORMAL.false_alarm`` (Garwood 1936).
     """
     often = min(1.0, float(found.sum()) / max(float(rate.sum()), 1e-12))
     expected, count = often * float(rate[unique].sum()), int(found[unique].sum())
     if expected < least:
         return 1.0
-    return float(gammaincinv(count, VERDICT.often)) / expected if count else 0.0
+    return float(gammaincinv(count, NORMAL.false_alarm)) / expected if count else 0.0
 
 
 def _counted(

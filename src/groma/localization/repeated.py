@@ -17,7 +17,7 @@ import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_in_threads
-from groma.gates import gate
+from groma.gates import NORMAL, gate
 from groma.localization.features import Bytes, unit
 from groma.localization.matching import Vectors, alike_elsewhere
 from groma.localization.pose.gates import VERDICT
@@ -27,7 +27,6 @@ from groma.localization.pose.gates import VERDICT
 class RepeatedGates:
     """When two places look alike."""
 
-    alike: float = gate(0.95, "quantile", "of distances of one point: nearer ones look alike", "convention: 95 %")
     sample: int = gate(20_000, "pairs", "of descriptors that this is computed from", "cost: 20 ms")
     images: int = gate(8, "images", "most alike, that each is compared with", "convention: as for a query")
 
@@ -121,5 +120,5 @@ def alike_limits(described: Described) -> FloatArray:
         if len(same):
             same = same[:: max(len(same) // GATES.sample, 1)]
             first, second = (unit(described.descriptor[rows[same + step]]) for step in (0, 1))
-            limits[int(upright)] = np.quantile(np.linalg.norm(first - second, axis=1), GATES.alike)
+            limits[int(upright)] = np.quantile(np.linalg.norm(first - second, axis=1), 1.0 - NORMAL.significance)
     return limits

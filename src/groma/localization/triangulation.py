@@ -38,7 +38,6 @@ from groma.solver.solve import solve
 class TriangulationGates:
     """Which features become points of the map."""
 
-    beam: float = gate(4.0, "sigma", "distance from an epipolar line", "derived from noise, and as much from the poses")
     depth: float = gate(0.2, "share", "of its distance: largest standard deviation of a point", "convention: a fifth")
 
 
@@ -76,7 +75,7 @@ def triangulate_features(
     for done, (i, j) in enumerate(pairs):
         say(done, len(pairs))
         found = match_descriptors(vectors[i], vectors[j])
-        near = _in_beam(scene, straight, features, (int(i), int(j)), found, GATES.beam)
+        near = _in_beam(scene, straight, features, (int(i), int(j)), found, NORMAL.mistake)
         edges.append(found[near] + begin[[i, j]])
     track = _tracks(np.concatenate(edges), np.repeat(np.arange(len(features)), np.diff(begin)))
     row = np.flatnonzero(track >= 0)

@@ -26,7 +26,7 @@ from groma.adjustment.terms.contract import Draft
 from groma.cameras import model as camera_model
 from groma.errors import InputError
 from groma.factors.contract import Ref
-from groma.gates import gate
+from groma.gates import NORMAL, gate
 from groma.geometry import quaternion
 from groma.geometry.algebra import unit
 from groma.scene import Scene
@@ -40,7 +40,6 @@ MOTIONS = "motions"
 class ReadoutGates:
     """Which row counts."""
 
-    near: float = gate(4.0, "sigma", "from the observed place, where a predicted row counts", "convention: four sigma")
     iterations: int = gate(3, "times", "that a row is predicted", "cost: each is ten times nearer than the last")
 
 
@@ -138,7 +137,7 @@ def _refs(
         near = np.zeros(len(pixels), dtype=bool)
         for _ in range(GATES.iterations):
             place = predict(offset)
-            near = np.linalg.norm(place - pixels, axis=1) <= GATES.near * sigma_px  # False for NaN
+            near = np.linalg.norm(place - pixels, axis=1) <= NORMAL.mistake * sigma_px  # False for NaN
             offset = np.where(near, offsets_of(scene, image_idx, np.where(near[:, None], place, pixels)), observed)
         offsets.append(offset)
     row = np.full(scene.num_images, len(table))

@@ -28,7 +28,7 @@ from groma.estimators.motion.degeneracy import what_is_common, why_open
 from groma.estimators.motion.groups import FREEDOM, Kind, changed_frame, moved, tangent_between
 from groma.estimators.motion.hypotheses import SAMPLE, propose
 from groma.estimators.motion.matches import LandmarkMatches, Prepared
-from groma.gates import chi_square_gate, gate
+from groma.gates import NORMAL, chi_square_gate, gate
 from groma.geometry import quaternion
 
 
@@ -36,7 +36,6 @@ from groma.geometry import quaternion
 class MotionGates:
     """What agrees with a motion, and when it is refused."""
 
-    level: float = gate(0.01, "probability", "that noise exceeds the gate of a match", "convention: 1 %")
     proposals: int = gate(500, "samples", "of matches", "cost: linear in it")
     compared: int = gate(100, "matches", "by which proposals are compared first", "cost: linear in it")
     kept: int = gate(40, "proposals", "compared by all matches", "cost: linear in it")
@@ -164,7 +163,7 @@ class _Search:
         self.kind: Kind = kind
         self.gates = options.gates
         self.prepared, self.rng = Prepared.of(matches), np.random.default_rng(options.seed)
-        of = [chi_square_gate(self.gates.level, 4), chi_square_gate(self.gates.level, 3)]
+        of = [chi_square_gate(NORMAL.false_alarm, 4), chi_square_gate(NORMAL.false_alarm, 3)]
         self.limit = np.repeat(of, [matches.num_lines, len(matches) - matches.num_lines])
 
     def agreeing(self, motion: FloatArray) -> BoolArray:

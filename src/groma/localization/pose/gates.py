@@ -13,7 +13,6 @@ class HypothesisGates:
     """Which poses are proposed from few matches."""
 
     slack: float = gate(2.0, "1", "of the limit, for poses from few matches", "derived from noise: they are noisier")
-    confidence: float = gate(0.9999, "probability", "that one sample held no outlier", "convention: PoseLib's default")
     min_trials: int = gate(
         100, "samples", "drawn at least", "chosen on castle, fountain, kitchen: as many agree as with 1,000"
     )
@@ -55,7 +54,6 @@ class VerdictGates:
         "chosen on the cabinet",
     )
     right: float = gate(0.999, "probability", "that the pose is right, for it to be believed", "convention: 1 in 1000")
-    chance: float = gate(0.5, "probability", "that it is right, for a pose to be told at all", "convention: even odds")
     center: float = gate(
         0.1, "share", "of the median distance: largest standard deviation of the centre", "convention: a tenth"
     )
@@ -77,9 +75,6 @@ class VerdictGates:
         0.25, "share", "of how often all points are found, that unique ones are found at least",
         "chosen on rendered facades: what is found in another place that looks like this one",
     )  # fmt: skip
-    often: float = gate(
-        0.01, "probability", "that unique points are found less often than that", "convention: 1 in 100"
-    )
     focal: float = gate(
         0.01, "share", "of the focal length: a step of its estimate that tells another lens", "convention: a hundredth"
     )

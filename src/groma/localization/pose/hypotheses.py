@@ -91,7 +91,7 @@ def propose(
         return None
     settings = {
         "max_reproj_error": errors[0], "max_epipolar_error": errors[1], "seed": seed,
-        "success_prob": HYPOTHESES.confidence, "min_iterations": min_trials,
+        "success_prob": 1.0 - NORMAL.never, "min_iterations": min_trials,
         "max_iterations": _trials(share, min_trials),
     }  # fmt: skip
     ends, lines = matches.segments2d, matches.segments3d
@@ -118,5 +118,5 @@ def _trials(share: float, min_trials: int) -> int:
     """
     if share <= 0.0:
         return HYPOTHESES.max_trials
-    wanted = 3.0 * np.log1p(-HYPOTHESES.confidence) / np.log1p(-(min(share, 0.99) ** 3))
+    wanted = 3.0 * np.log(NORMAL.never) / np.log1p(-(min(share, 0.99) ** 3))
     return int(np.clip(wanted, min_trials, HYPOTHESES.max_trials))

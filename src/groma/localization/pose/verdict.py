@@ -35,6 +35,7 @@ import numpy as np
 
 from groma._counted import counted
 from groma._typing import BoolArray, FloatArray
+from groma.gates import NORMAL
 from groma.geometry import se3
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.gates import VERDICT
@@ -111,7 +112,7 @@ def judge(
     agree = f"{counted(int(refined.point_inliers.sum()), 'points')} and " + counted(
         int(refined.line_inliers.sum()), "lines"
     )
-    if chance < VERDICT.chance:
+    if chance < NORMAL.majority:
         return Verdict(
             "failed", probability, f"No pose: only {agree} agree with the best one, as may happen by chance."
         )

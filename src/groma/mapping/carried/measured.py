@@ -22,7 +22,7 @@ from groma import cameras as camera_models
 from groma._counted import counted
 from groma._typing import FloatArray
 from groma.features.segments import Segments
-from groma.gates import chi_square_gate, gate
+from groma.gates import NORMAL, chi_square_gate, gate
 from groma.geometry import quaternion
 from groma.geometry.charts.plane_normal_offset import NormalOffsetPlane
 from groma.geometry.segment2 import segments_apart
@@ -41,7 +41,6 @@ class CarriedGates:
     """When what is found is what was measured before."""
 
     same_segment: float = gate(2.0, "px", "distance of the same segment, found twice", "convention: two pixels")
-    same_plane: float = gate(0.99, "share", "level of the test that two planes are one", "convention: level of a test")
 
 
 GATES = CarriedGates()
@@ -118,7 +117,7 @@ def with_measured_planes(found: Structure, before: Scene) -> Scene:
     scene, planes = found.scene, found.planes
     if not before.num_planes:
         return scene
-    row, limit = np.full(before.num_planes, -1), chi_square_gate(1.0 - GATES.same_plane, 3)
+    row, limit = np.full(before.num_planes, -1), chi_square_gate(NORMAL.false_alarm, 3)
     if len(planes):
         away = _misfits(before, planes.planes, planes.covariance)
         for plane in range(len(row)):

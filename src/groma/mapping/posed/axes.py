@@ -22,7 +22,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.errors import InputError
-from groma.gates import gate
+from groma.gates import NORMAL, gate
 from groma.geometry import quaternion
 from groma.mapping.posed.motions import Motions
 from groma.scene import Scene
@@ -40,7 +40,6 @@ class AxesGates:
     trusted: float = gate(np.radians(10.0), "rad", "of directions compared", "convention: a quarter of the cut")
     kept: float = gate(0.8, "share", "of the pairs, those that agree best", "convention: 10 %, twice")
     shuffles: int = gate(99, "orders", "of the poses, at random", "cost: tells one in a hundred")
-    chance: float = gate(0.05, "share", "of these that may fit as well as the file's", "convention: one in twenty")
     fewest: int = gate(5, "images", "for which such a comparison tells something", "derived from 120 orders of five")
 
 
@@ -80,7 +79,7 @@ def check_axes(scene: Scene, motions: Motions) -> None:
         return
     orders = [rng.permutation(rows) for _ in range(GATES.shuffles)]
     fitting = sum(score(Reading("", rotation[order], centers[order]), motions) <= own for order in orders)
-    if fitting > GATES.chance * GATES.shuffles:
+    if fitting > NORMAL.significance * GATES.shuffles:
         raise InputError(
             f"The poses contradict the photographs: motions between images are {np.degrees(own):.2g} degrees off on "
             f"average, and no more so in {fitting} of {GATES.shuffles} random orders of the poses. Check that names "

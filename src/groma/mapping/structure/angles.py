@@ -35,7 +35,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.directions import DirectionSet
 from groma.estimators.membership import Candidates, averaged_memberships
 from groma.estimators.plane_search import PlaneSet
-from groma.gates import chi_square_gate, gate
+from groma.gates import NORMAL, chi_square_gate, gate
 from groma.geometry.algebra import perpendicular, unit
 from groma.mapping.structure.relations import Pairs
 from groma.scene import Scene
@@ -75,8 +75,6 @@ class AngleGates:
     known: float = gate(
         0.01, "rad", "standard deviation of an angle, above which it says nothing", "chosen on synthetic rooms"
     )
-    wrong: float = gate(0.05, "share", "of wrong pairs to be expected among those kept", "convention: 5 %")
-    refused: float = gate(0.05, "probability", "that a right pair contradicts those kept before it", "convention: 5 %")
 
 
 GATES = AngleGates()
@@ -219,7 +217,7 @@ def right_angles(
     passed = certain & (squared < np.where(right, *(chi_square_gate(1.0 - level, freedom) for freedom in (1, 2))))
     order = np.flatnonzero(passed)[np.argsort(-told.probability[passed], kind="stable")]
     wrong = np.cumsum(1.0 - told.probability[order]) / np.arange(1, len(order) + 1)
-    kept = order[wrong <= gates.wrong]
+    kept = order[wrong <= NORMAL.significance]
     own = 0.5 * (gates.exact**2 + np.mean(told.deviation[family[kept]] ** 2)) if len(kept) else 0.0
     kept = np.sort(kept[_consistent(vectors, covariance + own * np.eye(3), found[kept], right[kept], gates)])
     times = np.bincount(found[kept].ravel(), minlength=len(vectors))
@@ -245,7 +243,7 @@ def _consistent(
     turn, joint = np.zeros((len(vectors), 2)), np.zeros((len(vectors), 2, len(vectors), 2))
     joint[np.arange(len(vectors)), :, np.arange(len(vectors))] = axes @ covariance @ np.swapaxes(axes, 1, 2)
     joint, late, used = joint.reshape(size, size), np.zeros((size, _LATE)), 0
-    limit = np.array([chi_square_gate(gates.refused / max(len(pairs), 1), freedom) for freedom in (2, 1)])
+    limit = np.array([chi_square_gate(NORMAL.significance / max(len(pairs), 1), freedom) for freedom in (2, 1)])
     places = (2 * pairs[:, :, None] + np.arange(2)).reshape(-1, 4)
     agree, start, tried = np.zeros(len(pairs), bool), 0, 1
     while start < len(pairs):

@@ -18,7 +18,7 @@ the whole has to be that of the piece with most members, by both covariances.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -27,7 +27,7 @@ from groma._typing import FloatArray, IntArray
 from groma.estimators.plane_fit import PlaneFit, fit_plane, plane_motions
 from groma.estimators.plane_search import PlaneSet, connected_to
 from groma.execution import map_in_threads
-from groma.gates import chi_square_gate, gate
+from groma.gates import NORMAL, chi_square_gate
 from groma.geometry.algebra import perpendicular
 from groma.mapping.structure.relations import Landmarks, Pairs, RelationGates, on_planes
 
@@ -38,13 +38,6 @@ _ROUNDS = 2
 _RELATIONS = RelationGates()
 #: Planes, and the points and the lines on them.
 _Told = tuple[PlaneSet, Pairs, Pairs]
-
-
-@dataclass(frozen=True)
-class RoughGates:
-    """What makes a plane a piece of another one's wall."""
-
-    part: float = gate(0.5, "share", "of the members of a piece that are on the whole", "convention: more than half")
 
 
 def on_fitted_planes(
@@ -153,7 +146,6 @@ def _whole(
     rough: float,
     fitted: Callable[[PlaneSet], _Told],
     level: float,
-    gates: RoughGates = RoughGates(),
 ) -> tuple[PlaneSet, list[int]]:
     """One plane for those of a group that are pieces of it, and which these are: the first alone if there are none.
 
@@ -167,7 +159,7 @@ def _whole(
         whole = _fitted(marks, _as_one(planes, group), *of_group, np.array([rough]))
         whole, *found = fitted(whole)
         on_whole = found[0], found[1]
-        parts = [_share(points, lines, b, *on_whole) > gates.part for b in group]
+        parts = [_share(points, lines, b, *on_whole) > NORMAL.majority for b in group]
         if all(parts) and deviations(*on_whole, 1)[0]:
             known = _with_shared_deviations(marks, whole, *on_whole, (points, lines), np.where(new < 0, 1, 0))
             if _same_normal(known, 0, planes, group[0], level):

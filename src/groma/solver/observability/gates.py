@@ -36,7 +36,6 @@ class DiagnosisGates:
     along: float = gate(math.radians(5.0), "rad", "a line runs along a motion; planes through it are one", _CLASSES)
     end_on: float = gate(math.radians(0.5), "rad", "a ray sees a line end-on", _CLASSES)
     flat: float = gate(1e-3, "share", "least extent of points on one plane, of the next", _CLASSES)
-    flat_sigmas: float = gate(2.0, "sigma", "or in terms of their uncertainty", "derived from normal noise: 1 in 22")
     max_flat: float = gate(0.1, "share", "but no more of the next extent", _CLASSES)
     most: float = gate(0.9, "share", "of all landmarks: no single one is named", _WORDS)
     visible: float = gate(0.02, "share", "a smaller part of a unit motion is not mentioned", _WORDS)

@@ -222,7 +222,7 @@ def _flat(inspection: Inspection, name: str, weakness: FloatArray, seen: Observe
         return []
     xyz = xyz - xyz.mean(axis=0)
     extent = np.sqrt(np.maximum(np.linalg.eigvalsh(xyz.T @ xyz / len(xyz)), 0.0))
-    uncertain = DIAGNOSIS.flat_sigmas * float(np.median(weakness[good] * seen.distance[good]))
+    uncertain = NORMAL.alike * float(np.median(weakness[good] * seen.distance[good]))
     if not extent[0] < max(DIAGNOSIS.flat * extent[1], min(uncertain, DIAGNOSIS.max_flat * extent[1])):
         return []
     return [

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from groma._typing import FloatArray, IntArray
-from groma.gates import chi_square_gate
+from groma.gates import NORMAL, chi_square_gate
 from groma.geometry import se3
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.refinement import refine
@@ -269,7 +269,7 @@ def _common(values: FloatArray, variance: FloatArray, least: int, floor: float) 
     variance = variance + floor**2
     middle, weight = float(np.median(values)), 1.0 / variance
     for _ in range(5):
-        agree = (values - middle) ** 2 < chi_square_gate(0.01, 1) * variance
+        agree = (values - middle) ** 2 < chi_square_gate(NORMAL.false_alarm, 1) * variance
         if agree.sum() < max(least, 0.5 * len(values)):
             return None
         weight = agree / variance

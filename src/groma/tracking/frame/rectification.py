@@ -24,6 +24,7 @@ from groma._typing import FloatArray
 from groma.errors import InputError
 from groma.features.images import GrayImage
 from groma.features.point_tracks import follow
+from groma.gates import NORMAL
 from groma.geometry import so3
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.stereo import Disparities
@@ -255,7 +256,7 @@ def fit_rows(
         angles = np.linalg.solve(weighted.T @ basis + loose, weighted.T @ offset)
         error = offset - basis @ angles
         scale = max(1.4826 * float(np.median(np.abs(error))), _LEAST_SCALE)
-        share = (error / (gates.loss * scale)) ** 2
+        share = (error / (NORMAL.far * scale)) ** 2
     # The covariance of a robust estimate from independent sums: how they push, by how the push changes with the angles.
     push = basis * (error / (1.0 + share) ** 2)[:, None]
     pushes = np.stack([np.bincount(cells, weights=column) for column in push.T], axis=1)

@@ -131,7 +131,6 @@ class RectificationGates:
         2.5, "px", "a described feature is refined by less", "derived from five pixels of coarse scales"
     )
     looks: int = gate(10, "pairs", "pairs that are asked until one shows enough", "cost: 0.1 seconds each")
-    loss: float = gate(3.0, "sigma", "scale of the Geman-McClure loss of rows", "derived from normal noise: 3 sigma")
     iterations: int = gate(15, "steps", "reweighted fits of rows", "cost: converges in fewer")
     cells: int = gate(8, "cells", "cells along the width, within which errors are alike", "chosen on KITTI 06")
     min_cells: int = gate(

@@ -111,7 +111,6 @@ class LandmarkPlaneGates:
     min_support: int = gate(
         10, "points", "on a plane (a line counts 2)", "derived from the search, which asks for as many"
     )
-    min_own: float = gate(0.5, "share", "of what a plane claims that no likelier one has", "convention: the majority")
 
 
 @dataclass(frozen=True)

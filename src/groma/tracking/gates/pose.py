@@ -69,10 +69,6 @@ class FindingGates:
     near: float = gate(6.0, "px", "a feature agrees within this distance; coarse scales are not precise", SEQUENCES)
     search: float = gate(0.07, "share", "where features are looked for around a guess, of the image's width", SEQUENCES)
     max_refined: int = gate(4, "poses", "proposals that are refined", "cost: time to find a pose")
-    even: float = gate(
-        2.0, "sigma", "numbers that agree with two poses differ by less: both are refined",
-        "derived from counts: their variance is their mean",
-    )  # fmt: skip
     same_shift: float = gate(
         0.01, "share", "a proposal this near to an earlier one is left out, of the depth", "cost: time"
     )
@@ -103,9 +99,6 @@ class VerificationGates:
     min_kept: float = gate(0.12, "share", "share of what the last keyframe measured", SEQUENCES)
     confirmed_evidence: float = gate(6.0, "score", "points and lines where depth confirms a pose", SEQUENCES)
     min_agreeing: float = gate(0.03, "share", "share of the features in view that agree with a found pose", SEQUENCES)
-    min_seen: float = gate(
-        0.5, "share", "share of the points in view that agree, or features are asked too", "convention: the majority"
-    )
     surprise: float = gate(2.0, "sigma", "a pose farther from the prediction is verified again", SEQUENCES)
     wider: float = gate(3.0, "ratio", "the prior of a pose found by features is wider", SEQUENCES)
     jump: float = gate(6.0, "sigma", "distance of a found pose from the prediction", SEQUENCES)

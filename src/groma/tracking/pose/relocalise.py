@@ -17,6 +17,7 @@ from functools import partial
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.gates import NORMAL
 from groma.geometry import se3
 from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import Straight, propose
@@ -237,7 +238,7 @@ class _Search:
         for k in np.argsort(-np.array(judged), kind="stable")[:most]:
             if self._best is not None:
                 agreeing = self._agreeing(self._best.estimate.pose)
-                if judged[k] < agreeing - self.gates.even * math.sqrt(agreeing):
+                if judged[k] < agreeing - NORMAL.alike * math.sqrt(agreeing):
                     break
             if self._is_known(starts[k]):
                 continue

@@ -15,6 +15,7 @@ from concurrent.futures import Executor
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.gates import NORMAL
 from groma.tracking.frame.camera import TrackCamera, apart, into
 from groma.tracking.frame.descriptor_pairs import PlacedFeatures
 from groma.tracking.frame.features import FrameFeatures
@@ -212,7 +213,7 @@ def misses_much(
     """
     index = before.index[track_map.points.alive[before.index]]
     expected = camera.project(into(pose, track_map.points.xyz[index]))
-    return bool(count < gates.verification.min_seen * camera.inside(expected, gates.points.border).sum())
+    return bool(count < NORMAL.majority * camera.inside(expected, gates.points.border).sum())
 
 
 def _share(estimate: PoseEstimate) -> float:

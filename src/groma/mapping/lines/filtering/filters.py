@@ -14,25 +14,13 @@ import numpy as np
 import scipy  # its parts are imported when something of them is first used
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.gates import gate
+from groma.gates import NORMAL
 from groma.mapping.lines.filtering.duplicates import not_duplicates
 from groma.mapping.lines.filtering.kinds import found_again
 from groma.mapping.lines.filtering.texture import edge_odds, num_expected
 from groma.mapping.lines.linking.tracks import Tracks
 from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.outcomes import Outcome
-
-
-@dataclass(frozen=True)
-class FilterGates:
-    """When a line is rejected."""
-
-    min_edge_probability: float = gate(
-        0.05, "probability", "of being an edge, below which a line is texture", "convention: texture at 95 %"
-    )
-
-
-GATES = FilterGates()
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +94,7 @@ def is_edge(
     again = found_again(kinds.length, kinds.strength, line_of, possible, len(seen), least)
     told = kinds.length, kinds.strength, kinds.sigma
     odds = edge_odds(told, line_of, possible, seen, expected, options.min_images)
-    return again & (odds >= scipy.special.logit(GATES.min_edge_probability))
+    return again & (odds >= scipy.special.logit(NORMAL.significance))
 
 
 def not_duplicate(tracks: Tracks, evidence: Evidence) -> Verdict:
