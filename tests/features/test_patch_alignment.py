@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from groma.errors import ShapeError
-from groma.features.patch_alignment import RADIUS, align_templates, cut_templates, smoothed
+from groma.features.images import smoothed
+from groma.features.patch_alignment import RADIUS, align_templates, cut_templates
 
 SHAPE = np.array([[1.08, 0.12], [-0.10, 0.95]])
 SHIFT = np.array([3.37, -2.81])

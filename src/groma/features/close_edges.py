@@ -25,7 +25,7 @@ import numpy.typing as npt
 from groma._typing import FloatArray, IntArray
 from groma.features.contract import SegmentDetector
 from groma.features.edge_fit import EDGES
-from groma.features.images import GrayImage, to_gray
+from groma.features.images import IMAGES, GrayImage, to_gray
 from groma.features.segments import Segments
 from groma.features.steps import beside, fit, profiles, two_steps
 from groma.gates import NORMAL, chi_square_gate, gate
@@ -43,7 +43,6 @@ class CloseEdgeGates:
         "chosen on halved photographs of Strecha's scenes; with 0.15 to 0.6 places are up to a quarter worse",
     )
     any_spread: float = gate(1.0, "1", "the same for an edge alone, shadows too", "derived from 0.3 to 2 pixels")
-    noise: float = gate(2.0, "grey levels", "noise of a pixel", "convention: a photograph of 8 bits in good light")
     model: float = gate(
         0.02,
         "1",
@@ -188,4 +187,4 @@ class _Profiles:
     def _weight(self, bins: FloatArray) -> FloatArray:
         """Inverse variances (N, K) of the mean grey levels of bins: noise, and what the model leaves out."""
         number, misfit = bins[:, :, 0], self.gates.model * (self.right - self.left)[:, None]
-        return number / (self.gates.noise**2 + number * misfit**2)
+        return number / (IMAGES.noise**2 + number * misfit**2)

@@ -33,18 +33,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-import numpy.typing as npt
 
 from groma._numba import inline_kernel, kernel, loop
 from groma._ordering import median
 from groma._typing import FloatArray
-from groma.features.images import GrayImage
+from groma.features.images import GrayImage, SmoothImage, smoothed
 from groma.gates import NORMAL, gate, numbers
-
-#: A grey image (H, W), smoothed.
-SmoothImage = npt.NDArray[np.float32]
 
 #: Samples across the segment reach this far on either side, pixels: the size of an array.
 REACH = 3
@@ -275,12 +270,6 @@ def measure_edges(image: GrayImage, ends: FloatArray, fit: bool = True) -> tuple
         Mean gradient across the segment, grey levels per pixel.
     """
     return measure_smoothed(smoothed(image) if len(ends) else np.zeros((0, 0), np.float32), ends, fit)
-
-
-def smoothed(image: GrayImage) -> SmoothImage:
-    """Return a grey image (H, W) as edges are measured in it, with less noise."""
-    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.8, borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(smooth, np.float32)
 
 
 def measure_smoothed(

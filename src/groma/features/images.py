@@ -3,18 +3,43 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from groma.errors import InputError, ShapeError
+from groma.gates import gate
 
 GrayImage = npt.NDArray[np.uint8]
+#: Grey levels (H, W), smoothed.
+SmoothImage = npt.NDArray[np.float32]
 
 #: Smaller images show no segment, pixels: a detector needs a few gradients (derived from their support).
 MIN_SIDE = 8
 #: Largest level in the format of 12 bits.
 _FULL_12_BITS = 4095
+
+
+@dataclass(frozen=True)
+class ImageGates:
+    """What grey levels are taken to be."""
+
+    noise: float = gate(2.0, "grey levels", "noise of a pixel", "convention: a photograph of 8 bits in good light")
+    blur: float = gate(
+        0.8, "px", "of images that are measured", "derived from cubic interpolation: exact to 0.01 pixels then"
+    )
+
+
+#: The numbers in use.
+IMAGES = ImageGates()
+
+
+def smoothed(image: GrayImage) -> SmoothImage:
+    """Return a grey image (H, W) as edges and patches are measured in it, with less noise."""
+    levels = image.astype(np.float32)
+    return np.asarray(cv2.GaussianBlur(levels, (0, 0), IMAGES.blur, borderType=cv2.BORDER_REPLICATE), np.float32)
 
 
 def to_gray(image: npt.NDArray[np.generic]) -> GrayImage:

@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from groma.errors import InputError
-from groma.features.edge_fit import measure_smoothed, smoothed
-from groma.features.images import MIN_SIDE, to_gray
+from groma.features.edge_fit import measure_smoothed
+from groma.features.images import MIN_SIDE, smoothed, to_gray
 from groma.features.merging import MERGES, merge_collinear
 from groma.features.segments import MIN_LENGTH, MIN_STRENGTH, Segments
 

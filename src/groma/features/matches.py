@@ -9,7 +9,7 @@ import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError, ShapeError
-from groma.features.segments import Segments
+from groma.features.segments import SEGMENTS, Segments
 from groma.gates import gate
 
 
@@ -17,7 +17,6 @@ from groma.gates import gate
 class RivalGates:
     """Candidates that continue the line of the best one are no rivals of it."""
 
-    distance: float = gate(2.0, "px", "distance from the line of the best one", "derived from edges one pixel wide")
     angle: float = gate(0.02, "rad", "and angle", "derived from a pixel at the ends of a segment")
 
 
@@ -122,7 +121,7 @@ def _best_and_rival(
         np.abs((line[:, :2] * ends[:, :2]).sum(axis=1) + line[:, 2]),
         np.abs((line[:, :2] * ends[:, 2:]).sum(axis=1) + line[:, 2]),
     )
-    is_rival = (other != chosen) & (distance > RIVALS.distance + RIVALS.angle * segments.length[other])
+    is_rival = (other != chosen) & (distance > SEGMENTS.on + RIVALS.angle * segments.length[other])
     rival = np.full(len(best), -np.inf)
     np.maximum.at(rival, owner[is_rival], evidence[is_rival])
     return best, rival

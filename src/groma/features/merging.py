@@ -14,6 +14,7 @@ import numpy as np
 
 from groma._trees import kd_tree
 from groma._typing import FloatArray
+from groma.features.segments import SEGMENTS
 from groma.gates import gate
 
 
@@ -24,7 +25,6 @@ class MergeGates:
     min_piece: float = gate(8.0, "px", "shortest piece of a segment", "derived from what LSD finds in noise")
     gap: float = gate(8.0, "px", "from the end of one piece to the beginning of the next", "chosen on Strecha's scenes")
     angle: float = gate(0.04, "rad", "between two pieces", "chosen on Strecha's scenes")
-    distance: float = gate(1.0, "px", "of an end point from the joined line", "derived from edges one pixel wide")
     overlap: float = gate(2.0, "px", "by which the next piece may begin before the end", "chosen on Strecha's scenes")
 
 
@@ -64,7 +64,7 @@ def merge_collinear(ends: FloatArray, gates: MergeGates = MERGES) -> FloatArray:
     across = np.abs(offset[:, 0] * along[longer, 1] - offset[:, 1] * along[longer, 0])
     ahead = (offset * along[longer]).sum(axis=1)
     parallel = (along[first] * along[second]).sum(axis=1) > np.cos(gates.angle)
-    joined = (first != second) & parallel & (across < gates.distance) & (ahead > -gates.overlap)
+    joined = (first != second) & parallel & (across < SEGMENTS.edge) & (ahead > -gates.overlap)
     first, second = first[joined], second[joined]
     graph = coo_matrix((np.ones(len(first)), (first, second)), shape=(len(ends), len(ends)))
     count, group = connected_components(graph, directed=False)
@@ -90,6 +90,6 @@ def merge_collinear(ends: FloatArray, gates: MergeGates = MERGES) -> FloatArray:
     np.maximum.at(high, owner, at)
     np.maximum.at(worst, owner, off)
 
-    straight = (size > 1) & (worst <= gates.distance)
+    straight = (size > 1) & (worst <= SEGMENTS.edge)
     whole = np.hstack([mean + low[:, None] * axis, mean + high[:, None] * axis])[straight]
     return np.vstack([ends[~straight[group]], whole])

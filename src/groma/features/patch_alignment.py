@@ -28,14 +28,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from groma._numba import inline_kernel, kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import ShapeError
-from groma.features.images import GrayImage
 from groma.gates import STRECHA, gate, numbers
 from groma.geometry.algebra import as_rows
 
@@ -58,9 +56,6 @@ class PatchGates:
     unexplained: float = gate(0.01, "share", "of the contrast squared, that no template explains", STRECHA)
     min_texture: float = gate(
         1.0, "grey levels squared", "templates with less are left alone", "derived from camera noise"
-    )
-    smoothing: float = gate(
-        0.8, "px", "blur of both images", "derived from cubic interpolation: exact to a hundredth of a pixel then"
     )
 
 
@@ -258,7 +253,7 @@ def _align_all(
     image, templates, fractions, template_index, pixels, shapes, gates, out_pixels, covariance, correlation
 ):  # fmt: skip
     """Align one template per row to the image; correlation NaN where it left the image or has no texture."""
-    spread, max_iterations, smallest_step, shape_sigma, unexplained, min_texture, _ = gates
+    spread, max_iterations, smallest_step, shape_sigma, unexplained, min_texture = gates
     window = np.empty(_SIDE)
     for k in range(_SIDE):
         window[k] = math.exp(-0.5 * ((k - RADIUS) / spread) ** 2)
@@ -315,12 +310,6 @@ class Alignment:
     def found(self) -> BoolArray:
         """(N,) whether the iteration ended inside the image, on texture."""
         return np.isfinite(self.correlation)
-
-
-def smoothed(image: GrayImage) -> npt.NDArray[np.float32]:
-    """Return the grey levels as templates are cut from and aligned to: float32, slightly smoothed."""
-    levels = image.astype(np.float32)
-    return np.asarray(cv2.GaussianBlur(levels, (0, 0), PATCHES.smoothing, borderType=cv2.BORDER_REPLICATE), np.float32)
 
 
 def cut_templates(smooth_image: npt.NDArray[np.float32], pixels: FloatArray) -> Templates:

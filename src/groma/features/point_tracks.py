@@ -39,6 +39,9 @@ class PointTrackGates:
         4.0, "ratio", "eigenvalue of a corner to that of noise", "derived from noise: three corners in 640 x 480 at 4"
     )
     quality: float = gate(0.005, "share", "eigenvalue of a corner, of the strongest", "chosen on rendered rooms")
+    max_shift: float = gate(
+        2.5, "px", "of a point from where it was expected", "chosen on cabinet, redkitchen and KITTI 06"
+    )
 
     @property
     def noise_eigenvalue(self) -> float:

@@ -15,11 +15,26 @@ import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError, ShapeError
+from groma.gates import LINE_MAPS, gate
 from groma.geometry import segment2
 
 #: Defaults of detected segments: shortest length, pixels, and smallest mean gradient across,
 #: grey levels (of 255) per pixel.
 MIN_LENGTH, MIN_STRENGTH = 20.0, 3.0
+
+
+@dataclass(frozen=True)
+class SegmentGates:
+    """What is one edge, and what lies on it."""
+
+    edge: float = gate(1.0, "px", "from each other, within which segments are one edge", "derived from a sharp lens")
+    on: float = gate(2.0, "px", "from a segment, within which a place or another segment is on it", LINE_MAPS)
+    angle: float = gate(0.1, "rad", "between a segment and the image of its line", "derived from short segments")
+    overlap: float = gate(0.3, "share", "of the shorter of two segments, that the other covers", LINE_MAPS)
+
+
+#: The numbers in use.
+SEGMENTS = SegmentGates()
 
 
 @dataclass(frozen=True)

@@ -10,22 +10,10 @@ import numpy as np
 from groma._numba import loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.features.matching.descriptor import Descriptors
-from groma.features.segments import Segments
-from groma.gates import gate
+from groma.features.matching.wide_baseline import WideBaselineOptions
+from groma.features.segments import SEGMENTS, Segments
 from groma.geometry import se3
 from groma.localization.pose.camera import QueryCamera
-
-
-@dataclass(frozen=True)
-class GuidedLineGates:
-    """Which segments may show a line that a pose puts near them."""
-
-    angle: float = gate(0.1, "rad", "between a segment and the image of a line", "derived from short segments")
-    overlap: float = gate(0.3, "share", "of the segment, that the image of a line covers", "convention: a third")
-    descriptor: float = gate(0.9, "1", "largest distance of descriptors", "convention: that of wide_baseline")
-
-
-GATES = GuidedLineGates()
 
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
@@ -128,7 +116,9 @@ def lines_near(
     product = np.empty(len(rows), np.float32)
     of_lines, of_segments = (np.ascontiguousarray(x, np.float32) for x in (seen.descriptors[order], descriptors))
     _most_alike(chosen[rows], columns, begin, of_lines, of_segments, product)
-    alike = np.sqrt(np.maximum(2.0 - 2.0 * product.astype(np.float64), 0.0)) <= GATES.descriptor
+    alike = (
+        np.sqrt(np.maximum(2.0 - 2.0 * product.astype(np.float64), 0.0)) <= WideBaselineOptions.max_descriptor_distance
+    )
     return np.column_stack([chosen[rows[alike]], columns[alike]])
 
 
@@ -137,11 +127,11 @@ def _pairs_near(lines: FloatArray, segments: FloatArray, reach: float) -> tuple[
     order = np.argsort(middle, axis=1, kind="stable")
     middle = np.take_along_axis(middle, order, axis=1)
     longest = float(np.nanmax(np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)))
-    beyond = max(0.5 - GATES.overlap, 0.0) * longest
+    beyond = max(0.5 - SEGMENTS.overlap, 0.0) * longest
     count = 4 * len(segments)
     while True:
         rows, columns = np.empty((2, count), np.int64)
-        found = _near(lines, segments, order, middle, beyond, reach, GATES.angle, GATES.overlap, rows, columns)
+        found = _near(lines, segments, order, middle, beyond, reach, SEGMENTS.angle, SEGMENTS.overlap, rows, columns)
         if found <= count:
             return rows[:found], columns[:found]
         count = found

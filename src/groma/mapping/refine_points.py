@@ -25,8 +25,8 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
 from groma.execution import map_work
 from groma.features.edge_fit import EDGES
-from groma.features.images import GrayImage
-from groma.features.patch_alignment import SIZE, Alignment, Templates, align_templates, cut_templates, smoothed
+from groma.features.images import GrayImage, smoothed
+from groma.features.patch_alignment import SIZE, Alignment, Templates, align_templates, cut_templates
 from groma.gates import gate
 from groma.geometry.algebra import norm, perpendicular, unit
 from groma.mapping.groups import grouped

@@ -22,6 +22,7 @@ class DepthPointGates:
     min_known: int = gate(4, "pixels", "known depths among a pixel and its eight neighbours", _SEQUENCES)
     jump: float = gate(0.01, "scene units", "depths around a pixel differ by less, plus a share", _SEQUENCES)
     jump_share: float = gate(0.04, "share", "share of the depth by which they may differ", _SEQUENCES)
+    correlation: float = gate(6.0, "samples", "pixels that err alike count as one", _SEQUENCES)
 
 
 #: The defaults.

@@ -39,7 +39,7 @@ from groma.errors import InputError, ShapeError
 from groma.features.matches import LineMatches, mutual_best
 from groma.features.matching.descriptor import Descriptors
 from groma.features.matching.nearby import NearbyPoints, nearby_points
-from groma.features.segments import Segments
+from groma.features.segments import SEGMENTS, Segments
 from groma.gates import gate
 
 #: Rows of the table of descriptor products held in memory (cost: memory).
@@ -56,7 +56,7 @@ class WideBaselineOptions:
     #: Candidates farther apart are skipped.
     max_descriptor_distance: float = 0.9
     #: Smallest epipolar overlap, as a share of the smaller extent; only with a fundamental matrix.
-    min_overlap: float = 0.3
+    min_overlap: float = SEGMENTS.overlap
     #: How far outside the epipolar beam an end point may lie, pixels.
     beam_tolerance: float = 2.0
     #: Points within this distance of a segment support it, pixels.
@@ -82,7 +82,6 @@ class EvidenceGates:
     points_missing: float = gate(0.3, "log odds", "for that of the points near one of them only", _SURVEYED)
     overlap: float = gate(2.4, "log odds", "for the whole epipolar overlap", _SURVEYED)
     unknown_overlap: float = gate(-0.25, "share", "stands for an overlap that is not known", _SURVEYED)
-    on_line: float = gate(2.0, "px", "nearer points are on no side of a line", "derived from edges one pixel wide")
     min_extent: float = gate(4.0, "beam tolerances", "extents across epipolar lines that give an overlap", _SURVEYED)
 
 
@@ -311,7 +310,7 @@ def candidates(
             row, segments_1.ends, segments_2.ends, one[row : row + ROWS_AT_ONCE] @ two.T,
             near_1.begin, near_1.point_id, near_1.distance, near_2.begin, near_2.point_id, near_2.distance,
             F, fundamental is not None, options.min_overlap, options.beam_tolerance,
-            EVIDENCE.min_extent * options.beam_tolerance, EVIDENCE.on_line, least,
+            EVIDENCE.min_extent * options.beam_tolerance, SEGMENTS.on, least,
         )  # fmt: skip
         pairs.append(found[0])
         features.append(found[1])

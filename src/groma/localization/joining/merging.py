@@ -19,6 +19,7 @@ from groma.errors import InputError
 from groma.estimators.motion.estimation import Motion, estimate_motion
 from groma.estimators.motion.groups import Kind
 from groma.estimators.motion.matches import LandmarkMatches
+from groma.features.segments import SEGMENTS
 from groma.gates import gate
 from groma.geometry.segment2 import segments_apart
 from groma.geometry.so3 import hat
@@ -32,7 +33,6 @@ from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.verdict import moved as way_between
 from groma.localization.posed_model import gather_photographs, with_photographs
 from groma.mapping.carried.kept_lines import with_lines_of
-from groma.mapping.carried.measured import GATES as CARRIED
 from groma.mapping.noise.landmarks import project_points
 from groma.scene import Scene, Similarity
 
@@ -81,7 +81,7 @@ class MergedModel:
 
     def with_lines(self, scene: Scene) -> Scene:
         """Return what was mapped of the model, with lines of both maps that were not found anew."""
-        return with_lines_of(scene, self.maps, self.names, self.same_lines, CARRIED.same_segment)
+        return with_lines_of(scene, self.maps, self.names, self.same_lines, SEGMENTS.on)
 
     def sentence(self) -> str:
         """Say how the maps were joined."""
@@ -231,7 +231,7 @@ def _same_lines(second: Localizer, image: int, found: LocalizedImage) -> IntArra
         return np.zeros((0, 2), np.int64)
     off = segments_apart(query.reshape(-1, 4), seen.segment[rows])
     nearest = off.argmin(axis=1)
-    hit = np.flatnonzero(off[np.arange(len(query)), nearest] < CARRIED.same_segment)
+    hit = np.flatnonzero(off[np.arange(len(query)), nearest] < SEGMENTS.on)
     return np.column_stack([seen.line_idx[rows[nearest[hit]]], found.line[inliers[hit]]])
 
 

@@ -14,15 +14,15 @@ found where one of them is takes over its measurements.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from groma import cameras as camera_models
 from groma._counted import counted
 from groma._typing import FloatArray
-from groma.features.segments import Segments
-from groma.gates import NORMAL, chi_square_gate, gate
+from groma.features.segments import SEGMENTS, Segments
+from groma.gates import NORMAL, chi_square_gate
 from groma.geometry import quaternion
 from groma.geometry.charts.plane_normal_offset import NormalOffsetPlane
 from groma.geometry.segment2 import segments_apart
@@ -34,16 +34,6 @@ from groma.scene import Planes, Scene
 #: Measurements that may be of planes; and of lines, planes or directions.
 _OF_PLANES = ("plane_observations", "distances", "known_planes", "known_directions")
 _OF_LANDMARKS = ("line_depths", *_OF_PLANES)
-
-
-@dataclass(frozen=True)
-class CarriedGates:
-    """When what is found is what was measured before."""
-
-    same_segment: float = gate(2.0, "px", "distance of the same segment, found twice", "convention: two pixels")
-
-
-GATES = CarriedGates()
 
 
 def ready_to_map(model: Scene) -> Scene:
@@ -71,7 +61,7 @@ def carried_depths(model: Scene, segments: Sequence[Segments]) -> FloatArray | N
             there, here = (_undistorted(model, number, one) for one in (ends[rows], own.ends))
             apart = np.nan_to_num(segments_apart(here, there), nan=np.inf)
             nearest = apart.argmin(axis=1)
-            on = np.flatnonzero(apart[np.arange(len(own)), nearest] < GATES.same_segment)
+            on = np.flatnonzero(apart[np.arange(len(own)), nearest] < SEGMENTS.on)
             nearest = nearest[on]
             measured = table.inverse_depth[rows[nearest]], table.sigma[rows[nearest]]
             values[on] = _depths_on(there[nearest], *measured, here[on])
@@ -103,7 +93,7 @@ def with_measured_lines(result: MapResult, model: Scene) -> MapResult:
     """Return a map with the lines of its model that have measured depths and were not found anew."""
     if not len(model.line_depths):
         return result
-    names = ((model.images.names,), np.zeros((0, 2), np.int64), GATES.same_segment)
+    names = ((model.images.names,), np.zeros((0, 2), np.int64), SEGMENTS.on)
     scenes = {name: with_lines_of(getattr(result, name), (model,), *names) for name in ("scene", "before")}
     return replace(result, **scenes)
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.features.depth.noise import DepthNoise
+from groma.features.depth.points import DEPTH_POINTS
 from groma.gates import NORMAL, gate
 from groma.mapping.depth.unit import ROBUST
 
@@ -27,12 +28,10 @@ from groma.mapping.depth.unit import ROBUST
 class MapNoiseGates:
     """How the noise of depth maps is estimated."""
 
-    min_points: int = gate(100, "depths", "that tell noise; else that of a Kinect", "convention: a hundred")
     groups: int = gate(10, "groups", "of depths, from near to far", "cost: two numbers are fitted")
     known_share: float = gate(0.5, "share", "of a group, the best known points, that tell it", "convention: a half")
     least: float = gate(1e-4, "share", "of the depth: no depth is known better", "derived from 16-bit files")
     cells: int = gate(6, "cells", "along the width of an image, in which errors are alike", "cost: 36 in a square")
-    correlation: float = gate(6.0, "samples", "pixels that err alike count as one", "chosen on cabinet, redkitchen")
 
 
 NOISE = MapNoiseGates()
@@ -61,8 +60,8 @@ def fitted_noise(depth: FloatArray, difference: FloatArray, sigma: FloatArray) -
     sigma : (N,) float64
         Standard deviations of the depths of the points.
     """
-    if len(depth) < NOISE.min_points:
-        return DepthNoise(correlation=NOISE.correlation, max_depth=1e6)
+    if len(depth) < NORMAL.sample:
+        return DepthNoise(correlation=DEPTH_POINTS.correlation, max_depth=1e6)
     groups = [
         rows[np.argsort(sigma[rows])][: math.ceil(NOISE.known_share * len(rows))]
         for rows in np.array_split(np.argsort(depth), NOISE.groups)
@@ -75,14 +74,14 @@ def fitted_noise(depth: FloatArray, difference: FloatArray, sigma: FloatArray) -
     constant, quadratic = nnls(np.column_stack([1.0 / spread, middle**2 / spread]), np.ones(len(middle)))[0]
     if constant == 0.0:
         constant = NOISE.least * float(middle[0])
-    return DepthNoise(float(constant), float(quadratic), 0.0, correlation=NOISE.correlation, max_depth=1e6)
+    return DepthNoise(float(constant), float(quadratic), 0.0, correlation=DEPTH_POINTS.correlation, max_depth=1e6)
 
 
 def shared_errors(whitened: FloatArray, image_idx: IntArray, cell: IntArray) -> SharedErrors:
     """Return the correlations of whitened differences (N,), by products of all pairs in a cell, and in an image."""
     good = np.abs(whitened) < NORMAL.mistake
     values, image, cell = whitened[good], image_idx[good], cell[good]
-    if len(values) < NOISE.min_points:
+    if len(values) < NORMAL.sample:
         return SharedErrors()
     sums = [np.bincount(index, values) for index in (cell, image)]
     counts = [np.bincount(index).astype(np.float64) for index in (cell, image)]

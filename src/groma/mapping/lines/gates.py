@@ -15,9 +15,7 @@ class AgreementGates:
     outlier_probability: float = gate(
         0.0027, "probability", "of noise alone making one line look like two", "convention: three standard deviations"
     )
-    min_overlap: float = gate(0.3, "share", "of the shorter of two, along the line", LINE_MAPS)
     min_common: float = gate(0.6, "share", "of the images of a line, that another explains", LINE_MAPS)
-    same_edge: float = gate(1.0, "px", "apart, two segments are one edge", "derived from the width of an edge")
 
     def max_squared(self, dof: int) -> float:
         """Largest squared Mahalanobis distance of two that agree."""

@@ -20,6 +20,7 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.line_intervals import supported_intervals
 from groma.execution import begin, map_in_threads
+from groma.features.segments import SEGMENTS
 from groma.gates import gate
 from groma.geometry import segment2
 from groma.geometry.algebra import ratio
@@ -83,7 +84,7 @@ def with_supported_intervals(scene: Scene) -> Scene:
 
 def _beside_edges(scene: Scene) -> BoolArray:
     """Tell beside which parts (L, 24) of lines their edges lie."""
-    ends, width, size = line_end_rows(scene), AGREEMENT.same_edge, scene.num_lines * GATES.parts
+    ends, width, size = line_end_rows(scene), SEGMENTS.edge, scene.num_lines * GATES.parts
     lines, starts = scene.line_observations.line_idx, range(0, max(len(ends.share), 1), _AT_ONCE)
     found = map_in_threads(partial(_shown_parts, ends, lines), [slice(start, start + _AT_ONCE) for start in starts])
     place, *values = (np.concatenate(columns) for columns in zip(*found, strict=True))
@@ -107,6 +108,6 @@ def _shown_parts(ends: LineEndRows, line_idx: IntArray, rows: slice) -> tuple[Fl
     weight = (middle[part] - share[seen, 0]) / (share[seen, 1] - share[seen, 0])
     away = residual[seen, 0] + weight * (residual[seen, 1] - residual[seen, 0])
     x, y = (row[seen, 0] + weight[:, None] * (row[seen, 1] - row[seen, 0])).T
-    leaves = np.abs(away) > AGREEMENT.same_edge
+    leaves = np.abs(away) > SEGMENTS.edge
     place = line_idx[rows][seen] * GATES.parts + part
     return place, np.ones(len(x)), leaves, x * x, x * y, y * y, x * away, y * away

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from groma.features.segments import SEGMENTS
+
 #: Shortest segment unless the caller says so, pixels.
 MIN_LENGTH = 12.0
 
@@ -32,7 +34,7 @@ class MapLinesOptions:
     #: Segments are directed, for example dark on the left: the same line then runs the same way in all images.
     directed: bool = True
     #: Fraction of the shorter of two segments that must overlap along the line.
-    min_overlap: float = 0.3
+    min_overlap: float = SEGMENTS.overlap
     #: Largest relative standard deviation of the depth of a two-view proposal.
     max_relative_sigma: float = 0.03
     #: Largest standard deviation of the end points of a line, relative to its distance from the cameras or to the

@@ -32,7 +32,7 @@ from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.pixel_residuals import squared_residuals_px
-from groma.gates import gate
+from groma.gates import NORMAL, gate
 from groma.mapping.noise.landmarks import GATES as LANDMARK_GATES
 from groma.mapping.noise.landmarks import pixels_of
 from groma.problem.residuals import residuals_of
@@ -47,9 +47,6 @@ class ObservationNoiseGates:
     max_fitted: float = gate(0.8, "share", "of the residuals that landmarks take", "derived from five tracks of two")
     min_views: int = gate(
         4, "observations", "of a landmark that tells its noise from chance", "derived from one degree of freedom in two"
-    )
-    min_landmarks: int = gate(
-        100, "landmarks", "of so many views, that tell the noise of all", "derived from 10 % of its error"
     )
     max_correlation: float = gate(0.8, "1", "of the two ends of segments", "chosen on benchmarks/surveyed.py")
 
@@ -90,7 +87,7 @@ def line_end_correlation(scene: Scene) -> float:
     Segments of lines that few images see follow their line and are left out; where no others are, it is zero.
     """
     first, second = _line_residuals(scene, 0.0).T
-    if len(first) < GATES.min_landmarks:
+    if len(first) < NORMAL.sample:
         return 0.0
     shift, turn = np.median(np.abs(first + second)) ** 2, np.median(np.abs(first - second)) ** 2
     return float(np.clip((shift - turn) / max(shift + turn, 1e-300), -GATES.max_correlation, GATES.max_correlation))
@@ -109,7 +106,7 @@ def line_bend(scene: Scene, end_correlation: float = 0.0) -> float:
     :math:`2 \log 2`, only :math:`\nu` is open; it follows by maximum likelihood. Infinite with too few segments.
     """
     squares = (_line_residuals(scene, end_correlation) ** 2).sum(axis=1)
-    usual = float(np.median(squares)) if len(squares) >= GATES.min_landmarks else 0.0
+    usual = float(np.median(squares)) if len(squares) >= NORMAL.sample else 0.0
     if usual <= 0.0:
         return math.inf
     freedom = np.geomspace(*_FREEDOM, _BENDS)
@@ -162,7 +159,7 @@ def with_point_noise(scene: Scene) -> Scene:
     seen = np.isfinite(residual).all(axis=1)
     squares, owner = (residual[seen] ** 2).sum(axis=1), table.point_idx[seen]
     number = np.bincount(owner, minlength=count)
-    if np.count_nonzero(number >= GATES.min_views) < GATES.min_landmarks:
+    if np.count_nonzero(number >= GATES.min_views) < NORMAL.sample:
         return scene
     # Fitting a point takes three of the two coordinates per observation; what is left is as if they all were smaller.
     freedom = np.maximum(2 * number - 3, 1)

@@ -114,7 +114,7 @@ def depths_that_do_not_fit(track_map: TrackMap, gates: DepthGates) -> list[str]:
         depth = into(keyframe.pose, points.xyz[table.index[told]])[:, 2]
         off.append(np.abs(depth - table.depth[told]) / table.depth_sigma[told])
     every = np.concatenate(off)
-    median = float(np.median(every)) if len(every) >= gates.min_depths else 0.0
+    median = float(np.median(every)) if len(every) >= NORMAL.sample else 0.0
     if median <= gates.max_misfit * MEDIAN_OF_NORMAL:
         return []
     return [

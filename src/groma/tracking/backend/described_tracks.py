@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.features.point_tracks import follow
+from groma.features.point_tracks import POINT_TRACKS, follow
 from groma.tracking.frame.camera import TrackCamera, back
 from groma.tracking.frame.features import Features
 from groma.tracking.frame.measurements import Measurements, PointMeasurements
@@ -61,7 +61,7 @@ def _matched(
         return first[:0], second[:0], np.zeros((0, 2))
     guess = two.features.pixel[second]
     there, good = follow(one.gray, two.gray, pixel[first], guess, levels=0, round_trip=None)
-    good &= np.linalg.norm(there - guess, axis=1) < gates.rectification.max_shift
+    good &= np.linalg.norm(there - guess, axis=1) < POINT_TRACKS.max_shift
     if good.sum() < gates.rectification.min_pairs:
         return first[:0], second[:0], np.zeros((0, 2))
     _, agree = cv2.findEssentialMat(

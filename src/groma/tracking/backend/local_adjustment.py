@@ -14,6 +14,7 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assemble import assemble, first_camera_gauge
 from groma.adjustment.assembly_options import AssemblyOptions
+from groma.gates import NORMAL
 from groma.geometry import se3
 from groma.problem.problem import Problem
 from groma.scene import Lines, Relations, Scene
@@ -31,8 +32,8 @@ from groma.tracking.pose.estimate import GATE
 
 #: Keyframes outside the window that are held as its border.
 BORDER = 8
-#: Number of columns in right images from which their noise is estimated, and its lower bound, of the stated one.
-MIN_COLUMNS, LEAST_NOISE = 100, 0.05
+#: Lower bound of the estimated noise of columns in right images, of the stated one.
+LEAST_NOISE = 0.05
 
 
 @dataclass
@@ -131,7 +132,7 @@ class AdjustmentJob:
         """
         table = self.point_table
         found = np.flatnonzero(np.isfinite(table.right[:, 0]))
-        if len(found) < MIN_COLUMNS:
+        if len(found) < NORMAL.sample:
             return
         column = self.camera.project(at[found] - [self.camera.baseline, 0.0, 0.0])[:, 0]
         error = np.abs(column - table.right[found, 0]) / table.sigma[found]

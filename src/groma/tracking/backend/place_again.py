@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from groma._typing import FloatArray, IntArray
+from groma.features.segments import SEGMENTS
 from groma.gates import NORMAL, chi_square_gate
 from groma.geometry import se3
 from groma.localization.pose.matches import Matches
@@ -227,9 +228,7 @@ def _same_lines(
         old = old[~np.isin(old, seen.index)]
     rows = np.flatnonzero(newer.track_map.lines.state[seen.index] == ALIVE)
     expected, visible = expected_segments(older.camera, table, old, pose, gates.lines)
-    first, second = assign(
-        expected[visible], seen.ends[rows], gates.lines.distance, gates.lines.angle, gates=gates.lines
-    )
+    first, second = assign(expected[visible], seen.ends[rows], gates.lines.distance, SEGMENTS.angle, gates=gates.lines)
     return np.column_stack([old[visible][first], seen.index[rows[second]]])
 
 

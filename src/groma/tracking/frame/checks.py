@@ -9,6 +9,8 @@ import numpy as np
 
 from groma._counted import counted
 from groma.errors import InputError, ShapeError
+from groma.features.images import IMAGES
+from groma.gates import NORMAL
 from groma.io.sequences.frame import Frame
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.gates import DEFAULT, CheckGates
@@ -34,7 +36,7 @@ class FrameChecks:
         else:
             small = frame.gray[::8, ::8].astype(np.float32)
             level, contrast = float(small.mean()), float(small.std())
-            if contrast < self._gates.min_contrast:
+            if contrast < NORMAL.alike * IMAGES.noise:
                 reason = "it is black" if level < 60 else "it is overexposed" if level > 200 else "it shows nothing"
             self._last_time = frame.timestamp
             if not reason:

@@ -19,6 +19,7 @@ from groma._numba import kernel, loop
 from groma._ordering import copy
 from groma._typing import FloatArray
 from groma.estimators.batch_least_squares import solve_damped
+from groma.features.images import IMAGES
 from groma.geometry import quaternion, se3, so3
 from groma.geometry.so3 import exp_kernel
 from groma.tracking.frame.camera import TrackCamera, into, rotation
@@ -174,7 +175,7 @@ def small_image(gray: npt.NDArray[np.uint8], gates: TurnGates = DEFAULT.turns) -
     height, width = gray.shape
     size = (gates.width, max(round(gates.width * height / width), 8))
     reduced = cv2.resize(gray, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    return np.asarray(cv2.GaussianBlur(reduced, (0, 0), gates.blur), np.float32)
+    return np.asarray(cv2.GaussianBlur(reduced, (0, 0), IMAGES.blur), np.float32)
 
 
 def turn_between(
@@ -239,7 +240,7 @@ def surroundings_agree(
     shape: tuple[int, int],
     pixels: FloatArray,
     guesses: FloatArray,
-    noise: float = DEFAULT.turns.noise,
+    noise: float = IMAGES.noise**2,
 ) -> tuple[float, float]:
     """Correlation of the surroundings of places in the first image with those of guesses in the second.
 
@@ -306,7 +307,7 @@ def turned_prediction(
 
     def agree(pose: FloatArray, pixels: FloatArray, places: FloatArray) -> tuple[float, float]:
         moved = pixels + camera.project(into(pose, places)) - camera.project(into(previous, places))
-        return surroundings_agree(before, now, shape, pixels, np.where(np.isfinite(moved), moved, -1e6), gates.noise)
+        return surroundings_agree(before, now, shape, pixels, np.where(np.isfinite(moved), moved, -1e6))
 
     if len(followed[0]) >= gates.min_places and agree(predicted, *followed)[0] > gates.agrees:
         return None

@@ -17,9 +17,8 @@ import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
 from groma.features.depth.noise import DepthNoise
-from groma.features.depth.points import depth_at
-from groma.features.edge_fit import SmoothImage, smoothed
-from groma.features.images import GrayImage
+from groma.features.depth.points import DEPTH_POINTS, depth_at
+from groma.features.images import GrayImage, SmoothImage, smoothed
 from groma.features.point_tracks import corners
 from groma.features.segments import Segments
 from groma.io.sequences.frame import Frame
@@ -314,7 +313,9 @@ class FrameFeatures:
 
 def segment_noise(gates: DepthGates = DEFAULT.depth) -> DepthNoise:
     """Errors of depth beside a segment."""
-    return DepthNoise(gates.min_sigma, gates.inverse_sigma, 0.0, correlation=gates.correlation, tilt=0.0, shift=0.0)
+    return DepthNoise(
+        gates.min_sigma, gates.inverse_sigma, 0.0, correlation=DEPTH_POINTS.correlation, tilt=0.0, shift=0.0
+    )
 
 
 @cache

@@ -60,7 +60,7 @@ def frame_planes(
     own = gates.frame_planes
     noise = DepthNoise(
         gates.depth.min_sigma, gates.depth.inverse_sigma, 0.0,
-        correlation=own.correlation, tilt=own.tilt, shift=own.shift, max_depth=max_depth,
+        correlation=own.correlation, tilt=own.tilt, shift=gates.depth.min_sigma, max_depth=max_depth,
     )  # fmt: skip
     options = PlaneSearchOptions(min_share=own.min_share, max_planes=own.max_planes)
     found = find_depth_planes(depth, camera.params, noise, options)

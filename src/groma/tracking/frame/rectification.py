@@ -23,7 +23,7 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.errors import InputError
 from groma.features.images import GrayImage
-from groma.features.point_tracks import follow
+from groma.features.point_tracks import POINT_TRACKS, follow
 from groma.gates import NORMAL
 from groma.geometry import so3
 from groma.tracking.frame.camera import TrackCamera
@@ -187,7 +187,7 @@ def find_pairs(
     if not len(here):
         return here, guess
     there, good = follow(left, right, here, guess, levels=0, round_trip=None)
-    good &= np.linalg.norm(there - guess, axis=1) < gates.max_shift
+    good &= np.linalg.norm(there - guess, axis=1) < POINT_TRACKS.max_shift
     return here[good], there[good]
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from groma.features.depth.points import DEPTH_POINTS
 from groma.tracking.frame.depth import DepthImage
 from groma.tracking.gates import DEFAULT, TrackingGates
 
@@ -45,7 +46,7 @@ def fill_sparse(depth: DepthImage, max_depth: float, gates: TrackingGates = DEFA
     scatter = np.sqrt(np.maximum(rr - a * xr - b * yr, 0.0))
     # Of the middle of the cell.
     dx, dy = np.arange(columns) + 0.5 - mx, np.arange(rows)[:, None] + 0.5 - my
-    variance = (1.0 + (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / determinant) * gates.depth.correlation / count
+    variance = (1.0 + (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / determinant) * DEPTH_POINTS.correlation / count
     sigma = gates.depth.inverse_sigma + gates.depth.min_sigma * r * r
     good &= (scatter < sparse.max_scatter * sigma) & (variance < sparse.max_reading**2) & (r > 0)
     wide = [np.repeat(np.repeat(value, cell, axis=0), cell, axis=1) for value in (good, r - a * mx - b * my, a, b)]

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
 from groma.features.images import GrayImage
-from groma.features.point_tracks import follow
+from groma.features.point_tracks import POINT_TRACKS, follow
 from groma.tracking.gates import DEFAULT, StereoGates
 
 Disparities = npt.NDArray[np.float32]
@@ -72,7 +72,7 @@ def match_right(
     there, good = follow(left, right, pixels[rows], guess_there, levels=0, window=gates.window, round_trip=None)
     there = out_of_image(there)
     good &= (np.abs(there[:, 1] - pixels[rows, 1]) < gates.max_row) & (
-        np.abs(there[:, 0] - guess[rows]) < gates.max_shift
+        np.abs(there[:, 0] - guess[rows]) < POINT_TRACKS.max_shift
     )
     good &= there[:, 0] < pixels[rows, 0] - 0.1
     out[rows[good]] = there[good]

@@ -14,7 +14,6 @@ SEQUENCES = "chosen on cabinet, redkitchen and KITTI 06"
 class CheckGates:
     """Frames that are of no use."""
 
-    min_contrast: float = gate(4.0, "grey levels", "images that spread less are blank", "derived from noise of 8 bits")
     sparse_depth: float = gate(
         0.2, "share", "depth images with fewer known depths are reported", "convention: a sentence for the reader only"
     )
@@ -26,7 +25,6 @@ class TurnGates:
 
     width: int = gate(64, "px", "width of the small images", SEQUENCES + " and rendered turns")
     steps: int = gate(12, "steps", "Gauss-Newton steps of an alignment", "cost: converges in fewer")
-    blur: float = gate(0.8, "px", "standard deviation of the blur of small images", SEQUENCES + " and rendered turns")
     min_overlap: float = gate(0.25, "share", "smallest overlap of two aligned images", SEQUENCES)
     outlier: float = gate(
         3.0,
@@ -36,9 +34,6 @@ class TurnGates:
     )
     converged: float = gate(
         0.02, "px", "an alignment ends when steps are smaller", "cost: a tenth of what it is good for"
-    )
-    noise: float = gate(
-        4.0, "grey levels squared", "energy of noise in the surroundings of a place", "derived from camera noise"
     )
     agrees: float = gate(0.8, "correlation", "a prediction that agrees so well needs no help", SEQUENCES)
     gain: float = gate(0.04, "correlation", "by how much a turn must agree better than a prediction", SEQUENCES)
@@ -56,7 +51,6 @@ class DepthGates:
     min_sigma: float = gate(0.003, "scene units", "a depth is not known better", "derived from millimetres in files")
     near: float = gate(0.5, "px", "depth beside a segment is read from this distance on", SEQUENCES)
     far: float = gate(4.5, "px", "and up to this distance, so that narrow faces are not missed", SEQUENCES)
-    correlation: float = gate(6.0, "samples", "neighbouring samples that err alike count as one", SEQUENCES)
     min_images: int = gate(
         8, "images", "that tell an offset of inverse depths", "derived from the samples of a variance good to a half"
     )
@@ -66,7 +60,6 @@ class DepthGates:
         "noise of depths to that stated, above which they are said not to fit",
         "convention: a sentence only",
     )
-    min_depths: int = gate(100, "depths", "that tell this noise", "derived from normal noise: known to an eighth")
     grid: int = gate(20, "px", "distance of the places whose depth is kept, and on planes", "cost: 768 in 640 x 480")
     far_share: float = gate(
         0.25, "share", "largest noise of a stereo depth; far points serve as well as near ones", SEQUENCES
@@ -91,7 +84,6 @@ class FramePlaneGates:
 
     correlation: float = gate(100.0, "samples", "neighbouring samples that err alike count as one", SEQUENCES)
     tilt: float = gate(0.004, "rad", "no plane is known better: depth cameras bend planes", SEQUENCES)
-    shift: float = gate(0.003, "scene units", "no plane is known better", SEQUENCES)
     min_share: float = gate(0.015, "share", "smallest share of the image on a plane", SEQUENCES)
     max_planes: int = gate(10, "planes", "planes of one frame", "cost: frames show fewer")
     min_places: int = gate(8, "places", "places on a plane; thin strips have fewer", SEQUENCES)
@@ -108,7 +100,6 @@ class StereoGates:
     texture: int = gate(8, "grey levels", "sum of gradients of a block that is matched at all", "chosen on KITTI 06")
     around: int = gate(6, "px", "a disparity is looked for within this distance", "chosen on KITTI 06")
     window: int = gate(17, "px", "width of the patches that refine a column", "chosen on KITTI 06")
-    max_shift: float = gate(2.5, "px", "distance of a refined column from where it was expected", "chosen on KITTI 06")
     max_row: float = gate(1.5, "px", "distance of a point from its row: rectification errs", "chosen on KITTI 06")
 
 
@@ -127,9 +118,6 @@ class RectificationGates:
     )
     num_features: int = gate(1500, "features", "described in each image of the first pairs", "cost: 0.1 seconds")
     max_disparity: float = gate(0.2, "share", "largest disparity, of the width of the image", "cost: search is wide")
-    max_shift: float = gate(
-        2.5, "px", "a described feature is refined by less", "derived from five pixels of coarse scales"
-    )
     looks: int = gate(10, "pairs", "pairs that are asked until one shows enough", "cost: 0.1 seconds each")
     iterations: int = gate(15, "steps", "reweighted fits of rows", "cost: converges in fewer")
     cells: int = gate(8, "cells", "cells along the width, within which errors are alike", "chosen on KITTI 06")

@@ -37,7 +37,6 @@ class PointGates:
     border: float = gate(
         8.0, "px", "distance of new points from the edge of the image", "derived from the patch: 15 px"
     )
-    max_correction: float = gate(2.5, "px", "shift of a point by the patch of a keyframe", SEQUENCES)
     patch_keyframes: int = gate(
         2, "keyframes", "keyframes whose patches are looked for in one frame", "cost: time per frame"
     )
@@ -64,10 +63,8 @@ class LineGates:
     min_sigma: float = gate(0.5, "px", "no segment is known better: lenses and edges are not straight", SEQUENCES)
     min_length: float = gate(15.0, "px", "shortest segment that is followed or looked for", SEQUENCES)
     border: float = gate(4.0, "px", "expected segments are cut at this distance from the edge of the image", SEQUENCES)
-    min_overlap: float = gate(0.3, "share", "overlap of a pair, of the shorter segment", SEQUENCES)
     depth_share: float = gate(0.1, "share", "inverse depths of a pair agree within this share", SEQUENCES)
     distance: float = gate(5.0, "px", "a segment is a line of the map within this distance", SEQUENCES)
-    angle: float = gate(0.1, "rad", "and angle", SEQUENCES)
     again_distance: float = gate(4.0, "px", "a line found again is this near to where the pose says", SEQUENCES)
     again_recent: int = gate(400, "lines", "newest lines that are looked for", "cost: time per frame")
     min_length_share: float = gate(0.04, "share", "a new line is longer than this share of its depth", SEQUENCES)

@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 
 from groma._typing import FloatArray, IntArray
 from groma.features.point_tracks import spread
+from groma.features.segments import SEGMENTS
 from groma.geometry import se3
 from groma.scene.landmarks import Lines
 from groma.tracking.frame.camera import TrackCamera, back, into
@@ -209,7 +210,7 @@ def _add_lines(track_map, camera, data, pose, followed: FollowedSegments, index:
     segments = detected.segments
     of_segment = np.full(len(segments), -1)
     # Segments of tracked lines.
-    rows, hits = assign(followed.ends, segments.ends, gates.distance, gates.angle, gates=gates)
+    rows, hits = assign(followed.ends, segments.ends, gates.distance, SEGMENTS.angle, gates=gates)
     of_segment[hits] = followed.index[rows]
     # Segments of other lines of the map.
     alive = np.flatnonzero(lines.alive)
@@ -219,7 +220,7 @@ def _add_lines(track_map, camera, data, pose, followed: FollowedSegments, index:
     free = np.flatnonzero(of_segment < 0)
     middle = 1.0 / np.maximum(into(pose, lines.segment[alive].mean(axis=1))[:, 2], 1e-6)
     inverse = detected.inverse_depth.mean(axis=1)
-    rows, hits = assign(expected, segments.ends[free], gates.distance, gates.angle, middle, inverse[free], gates)
+    rows, hits = assign(expected, segments.ends[free], gates.distance, SEGMENTS.angle, middle, inverse[free], gates)
     of_segment[free[hits]] = alive[rows]
     # New lines: initialised by depth along the segment, else tracked until they can be triangulated.
     free = np.flatnonzero(of_segment < 0)[: max(options.num_lines - int((of_segment >= 0).sum()), 0)]

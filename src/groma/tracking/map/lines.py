@@ -17,9 +17,10 @@ import numpy as np
 from groma._numba import loop
 from groma._rows import Rows, column
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.features.edge_fit import SmoothImage, measure_smoothed
-from groma.features.images import GrayImage
+from groma.features.edge_fit import measure_smoothed
+from groma.features.images import GrayImage, SmoothImage
 from groma.features.matching.flow import Flow
+from groma.features.segments import SEGMENTS
 from groma.geometry import quaternion, se3, segment2
 from groma.tracking.frame.camera import TrackCamera, into
 from groma.tracking.gates import DEFAULT, LineGates
@@ -159,7 +160,7 @@ def assign(
         return none, none
     one, two = _described(expected, expected_inverse), _described(ends, inverse)
     score = np.empty((len(one), len(two)))
-    limits = float(max_distance), float(np.cos(max_angle)), float(gates.min_overlap), float(gates.depth_share)
+    limits = float(max_distance), float(np.cos(max_angle)), float(SEGMENTS.overlap), float(gates.depth_share)
     _score_all(one, two, limits, score)
     best = np.argmin(score, axis=1)
     rows = np.flatnonzero(np.isfinite(score[np.arange(len(expected)), best]))

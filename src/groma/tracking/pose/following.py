@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.features.point_tracks import follow
+from groma.features.point_tracks import POINT_TRACKS, follow
 from groma.tracking.beside import beside
 from groma.tracking.frame.camera import TrackCamera, into
 from groma.tracking.frame.features import FrameFeatures
@@ -66,7 +66,7 @@ def follow_frame(
         tracks = tracks.take(track_map.points.state[tracks.index] != DEAD)
         if options.points:
             tracks = follow_points(
-                track_map, camera, tracks, before.gray, data.gray, predicted, previous, gates.points.max_correction
+                track_map, camera, tracks, before.gray, data.gray, predicted, previous, POINT_TRACKS.max_shift
             )
     alive = track_map.points.alive[tracks.index]
     with watch("depth"):

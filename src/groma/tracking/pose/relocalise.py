@@ -17,6 +17,7 @@ from functools import partial
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.features.segments import SEGMENTS
 from groma.gates import NORMAL
 from groma.geometry import se3
 from groma.localization.pose.gates import VERDICT
@@ -284,7 +285,7 @@ class _Search:
             # Features that are no point of the map yet take part by their place alone.
             temporary, table = _temporary_points(self.known, pairs, data)
             lines, line_table = match_lines(
-                track_map, camera, data, pose, factor * own.lines.distance, factor * own.lines.angle
+                track_map, camera, data, pose, factor * own.lines.distance, factor * SEGMENTS.angle
             )
             planes = self._planes_at(pose)
             if len(pairs) + len(line_table) + len(planes) < 3:

@@ -15,6 +15,7 @@ from concurrent.futures import Executor
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.features.segments import SEGMENTS
 from groma.gates import NORMAL
 from groma.tracking.frame.camera import TrackCamera, apart, into
 from groma.tracking.frame.descriptor_pairs import PlacedFeatures
@@ -117,7 +118,7 @@ class PoseVerification:
             return match_near(camera, found.known, features, pose, gates.finding.near, gates.features.max_bits_near)
 
         def votes_at(pose: FloatArray) -> int:
-            lines = match_lines(track_map, camera, data, pose, gates.lines.distance, gates.lines.angle)[0]
+            lines = match_lines(track_map, camera, data, pose, gates.lines.distance, SEGMENTS.angle)[0]
             return num_cells(camera, pixel[pairs_at(pose)[:, 1]]) + len(lines.index)
 
         pose = found.estimate.pose

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import BoolArray, IntArray
+from groma.features.segments import SEGMENTS
 from groma.gates import LINE_MAPS, gate
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.linking.growth import near_lines, votes_for_same
@@ -35,7 +36,7 @@ GATES = DuplicateGates()
 def not_duplicates(tracks: Tracks, neighbors: list[IntArray], min_images: int) -> BoolArray:
     """(L,) lines that no other line explains."""
     good, images = np.ones(tracks.num_lines, bool), tracks.num_images()
-    for reach, ratio in ((AGREEMENT.same_edge, GATES.min_ratio), (None, 1.0)):
+    for reach, ratio in ((SEGMENTS.edge, GATES.min_ratio), (None, 1.0)):
         hit = near_lines(tracks, neighbors, reach)
         owner = tracks.line_of[hit[:, 1]]
         stronger = (owner >= 0) & (images[hit[:, 0]] > images[owner]) & (images[hit[:, 0]] >= ratio * images[owner])

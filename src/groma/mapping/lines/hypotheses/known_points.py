@@ -15,8 +15,8 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray, IntArray
+from groma.features.segments import SEGMENTS
 from groma.gates import LINE_MAPS, gate
-from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.views import LineViews
 
 #: Points of one segment that are looked at (cost: time).
@@ -27,7 +27,6 @@ _MAX_POINTS = 16
 class KnownPointGates:
     """Which points lie on a segment, and agree."""
 
-    max_distance: float = gate(2.0, "px", "of a point from a segment, across and beyond", LINE_MAPS)
     tolerance: float = gate(0.01, "1", "relative difference of inverse depths", LINE_MAPS)
 
 
@@ -161,7 +160,7 @@ def lines_through_points(
     """
     index, values = np.empty((2 * len(ratios), 3), np.int64), np.empty((2 * len(ratios), 6))
     count = _propose(
-        views.ends[rows], views.line[rows], views.usable[rows], views.range[rows], ratios, *points, GATES.max_distance,
-        GATES.tolerance, AGREEMENT.min_overlap, slot, index, values,
+        views.ends[rows], views.line[rows], views.usable[rows], views.range[rows], ratios, *points, SEGMENTS.on,
+        GATES.tolerance, SEGMENTS.overlap, slot, index, values,
     )  # fmt: skip
     return index[:count], values[:count]

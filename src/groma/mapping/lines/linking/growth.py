@@ -24,6 +24,7 @@ import scipy  # its parts are imported when something of them is first used
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_work
+from groma.features.segments import SEGMENTS
 from groma.mapping.groups import distinct_pairs
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.hypotheses.places import Places
@@ -119,7 +120,7 @@ def _on_lines(
     tracks: Tracks, neighbors: list[IntArray], sigma: FloatArray, forward: FloatArray, max_squared: float
 ) -> tuple[IntArray, FloatArray]:
     """Lines and segments on them (M, 2), in the images of the lines and their neighbours; and squared distances."""
-    views, gates = tracks.views, (max_squared, AGREEMENT.min_overlap, tracks.gates.min_overlap_px)
+    views, gates = tracks.views, (max_squared, SEGMENTS.overlap, tracks.gates.min_overlap_px)
     work = []  # of each image with its own segments and the lines near it alone: it may be sent to another process
     for image, lines in enumerate(tracks.lines_near_images(neighbors)):
         rows = views.rows(image)

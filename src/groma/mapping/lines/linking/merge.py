@@ -27,6 +27,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.batch_least_squares import PROBLEMS_AT_ONCE
 from groma.estimators.two_point_line import across_basis, line_residuals
 from groma.execution import begin, map_ranges
+from groma.features.segments import SEGMENTS
 from groma.gates import gate
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.linking.tracks import Tracks
@@ -251,7 +252,7 @@ def _candidates(X: FloatArray, reach: FloatArray) -> tuple[IntArray, FloatArray]
     pairs, span = np.empty((4096, 2), np.int64), np.empty((4096, 2))
     while True:
         needed = _near_pairs(
-            pointers, members, first_bin, low, X, reach, MERGE.max_angle, AGREEMENT.min_overlap, pairs, span
+            pointers, members, first_bin, low, X, reach, MERGE.max_angle, SEGMENTS.overlap, pairs, span
         )
         if needed <= len(pairs):
             break
@@ -282,7 +283,7 @@ def seen_apart(tracks: Tracks, pairs: IntArray) -> BoolArray:
     views = tracks.views
     rows, pointers = tracks.table()
     apart = np.zeros(len(pairs), np.bool_)
-    limits = AGREEMENT.min_overlap, AGREEMENT.same_edge
+    limits = SEGMENTS.overlap, SEGMENTS.edge
     _apart(pairs, pointers, rows, views.image_idx, views.ends, views.line, *limits, apart)
     return apart
 
