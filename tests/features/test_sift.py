@@ -75,11 +75,11 @@ def test_the_strongest_are_kept(texture, monkeypatch):
 def test_places_are_described_in_tiles_as_in_the_whole_image(texture, monkeypatch):
     rng = np.random.default_rng(2)
     pixels = rng.random((300, 2)) * texture.shape[::-1]
-    whole, rows = sift.describe_upright(texture, pixels, 8.0)
+    whole, rows = sift.describe_upright(texture, pixels)
     assert len(rows) > 250
     monkeypatch.setattr(sift, "AT_ONCE", 1)
     monkeypatch.setattr(sift, "TILE", 256)
-    tiled, again = sift.describe_upright(texture, pixels, 8.0)
+    tiled, again = sift.describe_upright(texture, pixels)
     np.testing.assert_array_equal(again, rows)
     np.testing.assert_array_equal(tiled.descriptors, whole.descriptors)
     np.testing.assert_allclose(tiled.pixels, pixels[rows], atol=1e-3)

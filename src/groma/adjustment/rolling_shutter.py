@@ -27,6 +27,7 @@ from groma._counted import counted, natural_key
 from groma._trees import kd_tree
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.adjust import AdjustOptions, adjust
+from groma.adjustment.misfit.lens import LENS
 from groma.adjustment.report import AdjustResult, Progress
 from groma.adjustment.terms.readout import MOTIONS
 from groma.errors import InputError, ProblemError
@@ -60,9 +61,6 @@ class RollingShutterGates:
     max_images: int = gate(300, "images", "for which redundancy is computed; of more it is taken as one", "cost: time")
     parallel: float = gate(
         np.radians(30.0), "rad", "between directions of readout that are parallel", "convention: half of what decides"
-    )
-    explained: float = gate(
-        0.1, "share", "of the residuals' variance that motions explain, or they are left out", "convention: a tenth"
     )
 
 
@@ -214,7 +212,7 @@ def adjust_rolling_shutter(
     if still is None or rolling is None:
         return RollingShutterResult(result, found)
     explained = 1.0 - (rolling / still) ** 2
-    if explained < GATES.explained:
+    if explained < LENS.share:
         return RollingShutterResult(at_once, replace(found, explained=explained, left_out=True))
     return RollingShutterResult(result, replace(found, explained=explained))
 

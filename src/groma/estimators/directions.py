@@ -42,10 +42,10 @@ class DirectionGates:
     refine_steps: int = gate(12, "steps", "steps of the robust refinement", "cost: converges in fewer")
     max_candidates: int = gate(512, "directions", "candidates of one round", "cost: time of a search")
     max_scored: int = gate(4096, "features", "features that score them", "cost: time of a search")
-    max_refined: int = gate(3, "directions", "best candidates that are refined", "cost: time of a search")
     min_sine: float = gate(0.02, "rad", "of two normals that make a candidate", "derived from noise of 0.05 degrees")
     wider: float = gate(4.0, "1", "factor of the squared gate in the refinement", "chosen on synthetic rooms")
     max_move: float = gate(0.05, "rad", "longest step of the refinement", "derived from linearity")
+    parallel: float = gate(8.7e-4, "rad", "that exact directions deviate", "convention: 0.05 degrees")
     orthogonal_sigma: float = gate(
         2.6e-3, "rad", "of right angles", "derived from parallel ones, times three: 0.15 degrees"
     )
@@ -60,8 +60,8 @@ DIRECTIONS = DirectionGates()
 class DirectionOptions:
     """What counts as a common direction."""
 
-    #: How parallel things are that are meant to be, radians; added to the measured noise. 0.05 degrees.
-    parallel_sigma: float = 8.7e-4
+    #: How parallel things are that are meant to be, radians; added to the measured noise.
+    parallel_sigma: float = DIRECTIONS.parallel
     #: A feature agrees when the chi-square test of its residual passes at this level (convention: level of a test).
     level: float = 0.95
     #: Least number of features that agree beyond those that determine a direction, one line or two segments: four
@@ -255,7 +255,7 @@ def _search(features: Perpendicular, options: DirectionOptions) -> DirectionSet:
             scored = pool.take(rng.choice(len(remaining), DIRECTIONS.max_scored, replace=False))
         accepted = None
         order = np.argsort(-_score(scored, guesses, gate), kind="stable")
-        for start in guesses[order[: DIRECTIONS.max_refined]]:
+        for start in guesses[order[: PARALLEL.max_refined]]:
             direction, covariance = pool.refined(start, gate, *how)
             inside = pool.squared(direction[None])[0] < gate
             count = int(inside.sum())

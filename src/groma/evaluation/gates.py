@@ -23,7 +23,6 @@ class ScoreGates:
     max_anchors: int = gate(200_000, "places", "places on a reference that distances are sought from", "cost: memory")
     max_places: int = gate(1000, "places", "places on one segment", "cost: memory")
     plane_angle_deg: float = gate(10.0, "deg", "angle of planes that are the same", "convention: of plane benchmarks")
-    plane_share: float = gate(0.01, "share", "offset of the same plane, of the extent", "convention: as for lines")
     pose_angles_deg: tuple[float, ...] = gate(
         (1.0, 3.0, 5.0, 10.0), "deg", "thresholds of the area under the curve", "convention: image matching benchmarks"
     )

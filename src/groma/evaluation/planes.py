@@ -174,7 +174,7 @@ def evaluate_planes(
     if max_offset is None:
         every = np.concatenate([reference.points.xyz, reference.lines.segments.reshape(-1, 3)])
         sides = np.diff(np.percentile(every, (2, 98), axis=0), axis=0) if len(every) else np.zeros(3)
-        max_offset = SCORES.plane_share * float(np.linalg.norm(sides))
+        max_offset = SCORES.line_shares[-1] * float(np.linalg.norm(sides))
         if not max_offset > 0:
             raise InputError("The reference has no extent; pass max_offset in scene units.")
     return score_planes(

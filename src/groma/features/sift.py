@@ -41,6 +41,8 @@ AT_ONCE, TILE = 2**21, 1216
 _AROUND, _STEP = 96, 16
 #: Where OpenCV's places lie from the true ones because of the doubled image, pixels (derived: see above).
 _DOUBLED = np.array([-0.25, -0.25])
+#: Diameter of places that come without one, pixels (convention: half of a patch of SIFT's finest scale).
+PLACE_SIZE = 8.0
 #: Blur that SIFT takes images to have, pixels (its definition).
 _BLUR = 0.5
 
@@ -78,7 +80,7 @@ def find_blobs(image: GrayImage, most: int, contrast: float) -> Blobs:
     return found.take(np.sort(np.argsort(-found.response, kind="stable")[:most]))
 
 
-def describe_upright(image: GrayImage, pixels: FloatArray, size: float) -> tuple[Blobs, IntArray]:
+def describe_upright(image: GrayImage, pixels: FloatArray) -> tuple[Blobs, IntArray]:
     """Describe given places (n, 2), upright; also return the rows of those that are not left out, at the border."""
     sift, tiles = cv2.SIFT_create(), _Tiles.of(image)  # type: ignore[attr-defined]
     tile_of, parts, rows = tiles.tile_of(pixels), [Blobs.empty()], [np.zeros(0, np.int64)]
@@ -86,7 +88,7 @@ def describe_upright(image: GrayImage, pixels: FloatArray, size: float) -> tuple
         shown, shift = tiles.shown(image, tile)
         chosen = np.flatnonzero(tile_of == tile)
         places = [
-            cv2.KeyPoint(u - 0.5, v - 0.5, size, 0.0, 1.0, 0, row)
+            cv2.KeyPoint(u - 0.5, v - 0.5, PLACE_SIZE, 0.0, 1.0, 0, row)
             for row, (u, v) in zip(chosen.tolist(), (pixels[chosen] - shift).tolist(), strict=True)
         ]
         kept, described = sift.compute(shown, places)

@@ -46,7 +46,6 @@ class FeatureGates:
     )  # fmt: skip
     max_corners: int = gate(1000, "points", "corners described besides, the strongest", "cost: of matching")
     corner_distance: float = gate(6.0, "px", "least distance of corners", "cost: of matching")
-    corner_scale: float = gate(4.0, "px", "scale at which places without one are described", "convention: half a patch")
     min_sigma: float = gate(0.4, "px", "least noise of a point", "derived from residuals of triangulated points")
 
 
@@ -107,7 +106,7 @@ def find_corners(image: GrayImage) -> DescribedPoints:
 
 def describe_places(image: GrayImage, pixels: FloatArray) -> tuple[DescribedPoints, IntArray]:
     """Describe given places (n, 2), upright; those at the border are left out: also return the rows that are left."""
-    found, rows = describe_upright(image, pixels, 2.0 * FEATURES.corner_scale)
+    found, rows = describe_upright(image, pixels)
     return _described(found, True), rows
 
 

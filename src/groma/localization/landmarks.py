@@ -17,6 +17,7 @@ from groma.gates import gate
 from groma.localization.features import DescribedPoints, summed, unit
 from groma.localization.map_index import MapIndex
 from groma.localization.matching import Vectors, match_descriptors
+from groma.localization.repeated import GATES as REPEATED
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,6 @@ class LandmarkGates:
     corners: int = gate(200, "points", "of its corners, the strongest", "cost: of matching")
     landmarks: int = gate(6, "points", "of the map for each of these, first those of two images", "cost: of matching")
     dimensions: int = gate(48, "directions", "of descriptors", "derived from their energy: 97 to 98 %")
-    sample: int = gate(20_000, "descriptors", "that the directions are computed from", "cost: 10 ms")
 
 
 GATES = LandmarkGates()
@@ -47,7 +47,7 @@ class DescribedLandmarks:
     def of(index: MapIndex, upright: BoolArray, gates: LandmarkGates = GATES) -> DescribedLandmarks:
         """Average the descriptors of an index; ``upright`` (P,) are the points that were described so."""
         total = summed(index.descriptor, index.point, len(index.xyz))
-        step = max(len(index.descriptor) // gates.sample, 1)
+        step = max(len(index.descriptor) // REPEATED.sample, 1)
         some = unit(index.descriptor[::step])
         directions = np.ascontiguousarray(np.linalg.eigh(some.T @ some)[1][:, -gates.dimensions :])
         return DescribedLandmarks(directions, _short(total, directions), upright)

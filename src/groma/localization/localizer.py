@@ -43,6 +43,7 @@ from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.refinement import Refined
+from groma.localization.repeated import GATES as REPEATED
 from groma.localization.repeated import Described, alike_limits
 from groma.localization.retrieval import VladRetrieval
 from groma.mapping.photographs import check_cameras, read_gray
@@ -54,7 +55,6 @@ from groma.solver.linear.blas import one_blas_thread
 class LocalizerGates:
     """How much of a map a query is compared with."""
 
-    images: int = gate(8, "images", "of the map, the most alike, matched with a query", "cost: of matching")
     plain: int = gate(50, "cells", "that agree with a coarse pose; or all is matched", "convention: good to a seventh")
     near: int = gate(5, "images", "of those, whose points and lines are looked for near a pose", "cost: of matching")
 
@@ -291,7 +291,7 @@ class Localizer:
 
     def _alike(self, points: DescribedPoints) -> IntArray:
         """The images of the map to match with, the most alike first."""
-        wanted = self.options.gates.images
+        wanted = REPEATED.images
         if len(self.index.image) <= wanted:
             return np.arange(len(self.index.image))
         described = self._retrieval.gather(points.descriptors)

@@ -27,8 +27,8 @@ from groma.localization.pose.gates import VERDICT
 class RepeatedGates:
     """When two places look alike."""
 
-    sample: int = gate(20_000, "pairs", "of descriptors that this is computed from", "cost: 20 ms")
-    images: int = gate(8, "images", "most alike, that each is compared with", "convention: as for a query")
+    sample: int = gate(20_000, "descriptors", "that quantiles and directions are computed from", "cost: 20 ms")
+    images: int = gate(8, "images", "most alike, that each is compared with, and a query", "cost: of matching")
 
 
 GATES = RepeatedGates()

@@ -53,6 +53,7 @@ from groma.mapping.checkpoints import Stages, digest, digest_files, stage
 from groma.mapping.depth.segments import with_line_depths
 from groma.mapping.exchange import NeighborChooser, matches_for, neighbors_for, with_parts
 from groma.mapping.image_segments import detect_segments, given_segments
+from groma.mapping.lines.hypotheses.earlier import GATES as EARLIER
 from groma.mapping.lines.hypotheses.earlier import EarlierMap
 from groma.mapping.lines.in_views import map_lines_in_views
 from groma.mapping.lines.line_map import LineMap
@@ -85,9 +86,6 @@ class MappingGates:
         4.0, "sigma", "scale of the Cauchy loss of the last adjustment, relative to the noise of each point",
         "derived from Student's distribution that fits these residuals best, which bends at 4 to 5",
     )  # fmt: skip
-    moved_share: float = gate(
-        0.1, "share", "of the points that moved by more than the lines allow for: lines are mapped again", SURVEYED
-    )
     max_rounds: int = gate(4, "rounds", "of adjusting and mapping lines again", "cost: most maps need one")
 
 
@@ -229,7 +227,7 @@ def map_segments(
         # The lines as mapped are good starts, and only the adjusted ones tell the noise of the segments.
         told = begin(partial(_weighted, joint, options))
         earlier = EarlierMap(before, line_map)
-        moved = begin(partial(moved_px, before, joint, GATES.moved_share))
+        moved = begin(partial(moved_px, before, joint, EARLIER.moved_share))
         line_map = stages.run(find_lines_again, joint, segments, matches, neighbors, earlier, tag=tag)
         weighted = told()
         scene = with_line_depths(line_map.add_to(joint, segments), line_map, segments, depths)

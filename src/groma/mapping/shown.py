@@ -37,7 +37,6 @@ class ShownGates:
     )
     points: int = gate(200, "points", "of a pair at most", "cost: of describing them")
     least: int = gate(20, "points", "of a pair at least", "derived from ranks: the share is good to a tenth")
-    size: float = gate(8.0, "px", "diameter of the places that are described", "convention: as localisation does")
     roll: float = gate(0.5, "rad", "between the photographs of a pair", "convention: places are described upright")
     alike: float = gate(
         0.8, "share", "of other places that are less alike, in the median of the pairs",
@@ -81,7 +80,7 @@ def check_points_shown(scene: Scene, files: Sequence[Path], gates: ShownGates = 
 def _compared(scene: Scene, files: Sequence[Path], gates: ShownGates, image: int) -> tuple[float, str] | None:
     """How alike a photograph and another are where both see a point, and their names; None if these points are few."""
     other, pixels = _shared(scene, image, gates)
-    first, second = (_described(files[i], own, gates.size) for i, own in zip((image, other), pixels, strict=True))
+    first, second = (_described(files[i], own) for i, own in zip((image, other), pixels, strict=True))
     shown = first.any(axis=1) & second.any(axis=1)
     if shown.sum() < gates.least:
         return None
@@ -108,10 +107,10 @@ def _shared(scene: Scene, image: int, gates: ShownGates) -> tuple[int, list[Floa
     return other, [table.pixel[own[here[::step]]], table.pixel[there[there_too[::step]]]]
 
 
-def _described(file: Path, pixels: FloatArray, size: float) -> FloatArray:
+def _described(file: Path, pixels: FloatArray) -> FloatArray:
     """Descriptors (n, 128) of places of a photograph, of length one; zeros where there is none."""
     out = np.zeros((len(pixels), 128))
     if len(pixels):
-        found, rows = describe_upright(read_gray(file), pixels, size)
+        found, rows = describe_upright(read_gray(file), pixels)
         out[rows] = np.sqrt(found.descriptors / np.maximum(found.descriptors.sum(axis=1, keepdims=True), 1e-9))
     return out

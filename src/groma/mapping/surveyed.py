@@ -13,12 +13,12 @@ from typing import Any
 
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult, Progress
+from groma.adjustment.rolling_shutter import GATES as SETTLING
 from groma.adjustment.rolling_shutter import Motions, adjust_rolling_shutter, motions_of
 from groma.adjustment.survey.attach import Survey, Surveyed, with_survey
 from groma.adjustment.survey.given_poses import given_poses_of
 from groma.adjustment.survey.gross_errors import reliability_of, without_gross_errors
 from groma.adjustment.survey.records import Reliability
-from groma.gates import gate
 from groma.io.survey import WorldFrame
 from groma.mapping.checkpoint_files import SCENE
 from groma.mapping.checkpoints import stage
@@ -27,17 +27,6 @@ from groma.scene import Scene, Similarity
 from groma.scene.checks import check_scene_given
 from groma.scene.local_frame import usual_frame
 from groma.scene.survey import with_rejected
-
-
-@dataclass(frozen=True)
-class SurveyedGates:
-    """When a scene is adjusted again with better weights."""
-
-    wrong: float = gate(1.15, "times", "that the noise is off, for another adjustment", "cost: 15 % of a weight")
-    max_rounds: int = gate(3, "adjustments", "of a scene", "cost: most need one")
-
-
-GATES = SurveyedGates()
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,10 +90,10 @@ def adjust_surveyed(
         surveyed = replace(surveyed, scene=with_rejected(surveyed.scene, ()))
     chosen = weighted(surveyed.scene, options or AdjustOptions())
     result = adjust(surveyed.scene, chosen, progress)
-    for _ in range(GATES.max_rounds - 1):
+    for _ in range(SETTLING.max_rounds - 1):
         better = weighted(result.scene, chosen)
         ratio = better.point_sigma_px / chosen.point_sigma_px
-        if 1.0 / GATES.wrong <= ratio <= GATES.wrong:
+        if 1.0 / SETTLING.settled <= ratio <= SETTLING.settled:
             break
         chosen = better
         result = adjust(surveyed.scene, chosen, progress)

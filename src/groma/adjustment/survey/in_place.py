@@ -155,7 +155,7 @@ def _check_exchanged(scene: Scene, survey: Survey, source: FloatArray, fit: Robu
         other = robust_similarity(source, common_frame([swapped])[0][0][found])
     except InputError:
         return
-    if fit is None or other.scatter * GATES.mirrored < fit.scatter:
+    if fit is None or other.scatter * GATES.better < fit.scatter:
         raise InputError(
             f"{given.source}: its places fit the scene much better with longitude and latitude exchanged. x is the "
             "longitude; correct the order."

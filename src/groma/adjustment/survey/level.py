@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import FloatArray
+from groma.adjustment.survey.similarity import GATES as SIMILARITY
 from groma.adjustment.survey.similarity import turn_between
 from groma.adjustment.survey.triangulate import triangulated
 from groma.errors import InputError
@@ -29,7 +30,6 @@ class LevelGates:
     """When directions measured in cameras fit the scene."""
 
     apart_deg: float = gate(10.0, "degrees", "by which directions differ if axes are doubted", "cost: a refused phone")
-    better: float = gate(3.0, "times", "nearer with other axes, for these to be named", "cost: a wrong hint")
 
 
 GATES = LevelGates()
@@ -162,7 +162,7 @@ def _check_axes(
         angles[words] = _median_angle(_rotation(seen, wanted) if rotation is None else rotation, seen, wanted)
     best = min(angles, key=lambda words: angles[words])
     fitting = " or ".join(words for words, angle in angles.items() if angle <= angles[best] + noise)
-    hint = f" With {fitting} it is {angles[best]:.2g}." if angles[best] * GATES.better < apart else ""
+    hint = f" With {fitting} it is {angles[best]:.2g}." if angles[best] * SIMILARITY.better < apart else ""
     raise InputError(
         f"The directions measured in the photographs contradict their poses: most are off by {apart:.0f} degrees or "
         f"more.{hint} Expected are the axes of the camera: x right, y down, z forward."

@@ -11,6 +11,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.adjustment.survey.level import GATES
+from groma.adjustment.survey.similarity import GATES as SIMILARITY
 from groma.errors import InputError
 from groma.gates import NORMAL
 from groma.geometry import quaternion
@@ -58,7 +59,9 @@ def check_orientations(scene: Scene, rotation: FloatArray | None) -> None:
     }
     angles = {words: _apart(turns, own, whole) for words, (turns, whole) in others.items()}
     best = min(angles, key=lambda words: angles[words])
-    hint = f" They fit to {angles[best]:.2g} degrees if they {best}." if angles[best] * GATES.better < apart else ""
+    hint = (
+        f" They fit to {angles[best]:.2g} degrees if they {best}." if angles[best] * SIMILARITY.better < apart else ""
+    )
     raise InputError(
         f"The orientations of the measured poses contradict the photographs: most are off by {apart:.0f} degrees or "
         f"more.{hint} Expected are qx qy qz qw from the camera (x right, y down, z forward) to the world."

@@ -30,9 +30,7 @@ class SimilarityGates:
     """How a similarity to measurements is found."""
 
     draws: int = gate(500, "triples", "of correspondences tried", "derived from 1e-7 without a good one, 70 % inliers")
-    mirrored: float = gate(
-        3.0, "times", "the scatter falls if the axes are mirrored: they are left-handed", "chosen on random point sets"
-    )
+    better: float = gate(3.0, "times", "a fit must get with other axes, to name them", "chosen on random point sets")
 
 
 GATES = SimilarityGates()
@@ -74,7 +72,7 @@ def robust_similarity(source: FloatArray, target: FloatArray) -> RobustSimilarit
     if len(source) > 3:
         mirror = np.array([-1.0, 1.0, 1.0])
         mirrored = _fitted(source * mirror, target)
-        if mirrored.inliers.sum() >= found.inliers.sum() and mirrored.scatter * GATES.mirrored < found.scatter:
+        if mirrored.inliers.sum() >= found.inliers.sum() and mirrored.scatter * GATES.better < found.scatter:
             raise InputError(
                 f"The measured places fit a mirror image of the scene ({mirrored.scatter:.3g} instead of "
                 f"{found.scatter:.3g}): their axes are left-handed. Are two axes exchanged, such as north and east, or "

@@ -92,7 +92,7 @@ def check_places(source: FloatArray, target: FloatArray, fit: RobustSimilarity, 
         except InputError:
             continue
         off = _rms(other, stretch)  # as measured, or heights of pure noise would always fit better if they were less
-        if other.inliers.sum() >= fit.inliers.sum() and off * SIMILARITY.mirrored < own:
+        if other.inliers.sum() >= fit.inliers.sum() and off * SIMILARITY.better < own:
             high, wide = ("feet", "metres") if ratio < 1.0 else ("metres", "feet")
             raise InputError(
                 f"The measured places fit the scene much better ({off:.3g} instead of {own:.3g}) if their heights are "

@@ -54,10 +54,9 @@ class VerdictGates:
         "chosen on the cabinet",
     )
     right: float = gate(0.999, "probability", "that the pose is right, for it to be believed", "convention: 1 in 1000")
-    center: float = gate(
-        0.1, "share", "of the median distance: largest standard deviation of the centre", "convention: a tenth"
+    loose: float = gate(
+        0.1, "rad", "largest deviation of the rotation; of the centre, over the median distance", "convention: a tenth"
     )
-    turn: float = gate(0.1, "rad", "largest standard deviation of the rotation", "convention: a tenth")
     distinct: float = gate(
         5.0, "thresholds", "by which another pose moves what is seen, in the median", "derived from noise: well beyond"
     )

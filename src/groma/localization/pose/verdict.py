@@ -131,7 +131,7 @@ def judge(
         )
     sigma = np.sqrt(np.diag(covariance))
     if not (
-        np.isfinite(sigma).all() and sigma[3:].max() <= VERDICT.turn and sigma[:3].max() <= VERDICT.center * distance
+        np.isfinite(sigma).all() and sigma[3:].max() <= VERDICT.loose and sigma[:3].max() <= VERDICT.loose * distance
     ):
         return Verdict("uncertain", probability, f"{agree} agree, but they do not determine the pose: {_open(sigma)}.")
     return Verdict("localized", probability, f"{agree} agree.")

@@ -37,7 +37,6 @@ class AxesGates:
 
     cut: float = gate(np.radians(40.0), "rad", "at which disagreement counts no more", "convention: half a right angle")
     better: float = gate(0.5, "share", "of the score of the file's reading: another is right", "chosen on fountain-P11")
-    trusted: float = gate(np.radians(10.0), "rad", "of directions compared", "convention: a quarter of the cut")
     kept: float = gate(0.8, "share", "of the pairs, those that agree best", "convention: 10 %, twice")
     shuffles: int = gate(99, "orders", "of the poses, at random", "cost: tells one in a hundred")
     fewest: int = gate(5, "images", "for which such a comparison tells something", "derived from 120 orders of five")
@@ -97,7 +96,7 @@ def score(reading: Reading, motions: Motions) -> float:
     way = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
     seen = np.einsum("nij,nj->ni", reading.rotation[second], way)
     swing = np.arccos(np.clip(np.einsum("ni,ni->n", seen, motions.direction), -1.0, 1.0))
-    parts = (turn, swing[motions.direction_sigma < GATES.trusted])
+    parts = (turn, swing[motions.direction_sigma < GATES.cut / 4])
     return float(np.mean([np.mean(_best(np.minimum(part, GATES.cut))) for part in parts if len(part)]))
 
 

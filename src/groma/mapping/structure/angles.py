@@ -32,7 +32,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.estimators.directions import DirectionSet
+from groma.estimators._parallel_lines import PARALLEL
+from groma.estimators.directions import DIRECTIONS, DirectionSet
 from groma.estimators.membership import Candidates, averaged_memberships
 from groma.estimators.plane_search import PlaneSet
 from groma.gates import NORMAL, chi_square_gate, gate
@@ -62,8 +63,6 @@ class AngleGates:
     layer: float = gate(
         0.15, "rad", "window around right and zero angles, for the mixture", "chosen on synthetic rooms"
     )
-    exact: float = gate(8.7e-4, "rad", "that angles deviate which count as exact", "convention: 0.05 degrees")
-    most: float = gate(8.7e-3, "rad", "that angles deviate which are meant to be right", "convention: half a degree")
     nearly: float = gate(
         0.036,
         "rad",
@@ -144,7 +143,7 @@ def _known_by_directions(
         normal, of = normals[k], np.flatnonzero(inside[k])
         axes, vectors = np.stack(perpendicular(normal)), directions.vectors[of]
         own, slope, off = axes @ covariance[k] @ axes.T, vectors @ axes.T, vectors @ normal
-        noise = np.diag(np.einsum("i,dij,j->d", normal, directions.covariance[of], normal) + gates.exact**2)
+        noise = np.diag(np.einsum("i,dij,j->d", normal, directions.covariance[of], normal) + DIRECTIONS.parallel**2)
         total = slope @ own @ slope.T + noise
         if off @ np.linalg.solve(total, off) > chi_square_gate(1.0 - level, len(of)):
             inside[k] = False
@@ -197,7 +196,7 @@ def right_angles(
     live = np.column_stack([np.ones(len(found)), (~right).astype(np.float64)])
     certain = (variance * live).max(axis=1) < gates.known**2
     telling = certain if implied is None else certain & ~implied[found[:, 0], found[:, 1]]
-    exact = variance + gates.exact**2 * live
+    exact = variance + DIRECTIONS.parallel**2 * live
     family = 2 * kind[found].sum(axis=1) + right
     even = np.where(right, 0.5 / gates.layer, 1.0 / (np.pi * gates.layer**2))
     told = averaged_memberships(
@@ -210,7 +209,7 @@ def right_angles(
             counted=telling,
             group=family,
         ),
-        np.full(6, gates.most),
+        np.full(6, PARALLEL.nearly),
         _worth(found[telling], family[telling], len(vectors)),
     )
     squared = (offset**2 / (exact + (told.deviation[family, None] * live) ** 2)).sum(axis=1)
@@ -218,7 +217,7 @@ def right_angles(
     order = np.flatnonzero(passed)[np.argsort(-told.probability[passed], kind="stable")]
     wrong = np.cumsum(1.0 - told.probability[order]) / np.arange(1, len(order) + 1)
     kept = order[wrong <= NORMAL.significance]
-    own = 0.5 * (gates.exact**2 + np.mean(told.deviation[family[kept]] ** 2)) if len(kept) else 0.0
+    own = 0.5 * (DIRECTIONS.parallel**2 + np.mean(told.deviation[family[kept]] ** 2)) if len(kept) else 0.0
     kept = np.sort(kept[_consistent(vectors, covariance + own * np.eye(3), found[kept], right[kept], gates)])
     times = np.bincount(found[kept].ravel(), minlength=len(vectors))
     per_vector = max(len(kept) / max(np.count_nonzero(times), 1), 1.0)
@@ -304,7 +303,7 @@ def _normal(offset: FloatArray, variance: FloatArray) -> FloatArray:
 
 def _upper_end(squared: FloatArray, variance: FloatArray, pairs_per_vector: float, gates: AngleGates) -> float:
     """Upper end of the confidence interval of t; pairs of few vectors tell less than as many independent ones."""
-    tried = np.geomspace(gates.held, gates.most, gates.tried)
+    tried = np.geomspace(gates.held, PARALLEL.nearly, gates.tried)
     total = variance + tried[:, None] ** 2
     surprise = (np.log(total) + squared / total).sum(axis=1)
     return float(tried[np.flatnonzero(surprise <= surprise.min() + pairs_per_vector)[-1]])

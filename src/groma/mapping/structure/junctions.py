@@ -26,12 +26,10 @@ class JunctionGates:
     """Which lines may meet."""
 
     reach_px: float = gate(8.0, "px", "from the end of a line to the place of meeting", STRUCTURE)
-    layer_px: float = gate(8.0, "px", "window of distances for the mixture of meeting and passing lines", STRUCTURE)
     end_px: float = gate(2.5, "px", "deviation of the end of a line from where it meets another", STRUCTURE)
     most_px: float = gate(1.0, "px", "that lines that meet may miss each other", "chosen on benchmarks/structure.py")
     min_sine: float = gate(0.17, "1", "of the angle of two lines that meet", "convention: ten degrees")
     nearest: int = gate(24, "samples", "of lines that an end of a line is compared with", "cost: time of a search")
-    sample_px: float = gate(8.0, "px", "between samples of a line", "derived from the reach")
     max_samples: int = gate(256, "samples", "of a line", "cost: memory")
 
 
@@ -59,7 +57,7 @@ def meetings(marks: Landmarks, level: float, least: float) -> Pairs:
         for own, other in ((along[0], along[1]), (along[1], along[0]))
     )
     pixel = 0.5 * (marks.line_pixel[first] + marks.line_pixel[second])
-    near = (sine > GATES.min_sine) & (np.abs(dot(between, normal)) < GATES.layer_px * pixel)
+    near = (sine > GATES.min_sine) & (np.abs(dot(between, normal)) < GATES.reach_px * pixel)
     gap = []
     for line, place in ((first, share[0]), (second, share[1])):
         length_px = norm(ends[line, 1] - ends[line, 0]) / marks.line_pixel[line]
@@ -96,7 +94,7 @@ def _candidates(distance: FloatArray, variance: FloatArray, gap: FloatArray) -> 
         offset=np.column_stack([distance, np.where(ending, gap, 0.0)]),
         variance=np.column_stack([variance, end_variance]),
         unit=np.tile([1.0, 0.0, 0.0], (num, 1)),
-        clutter=np.full(num, 0.5 / GATES.layer_px * even**2),
+        clutter=np.full(num, 0.5 / GATES.reach_px * even**2),
         counted=np.ones(num, bool),
         group=np.zeros(num, np.int64),
     )
@@ -105,7 +103,7 @@ def _candidates(distance: FloatArray, variance: FloatArray, gap: FloatArray) -> 
 def _neighbours(segments: FloatArray, pixel: FloatArray) -> IntArray:
     """Pairs (M, 2) of segments, one of which ends near the other; the smaller number first."""
     length = norm(segments[:, 1] - segments[:, 0])
-    count = np.clip(np.ceil(length / (GATES.sample_px * pixel)), 2, GATES.max_samples).astype(np.int64)
+    count = np.clip(np.ceil(length / (GATES.reach_px * pixel)), 2, GATES.max_samples).astype(np.int64)
     owner = np.repeat(np.arange(len(segments)), count)
     number = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
     share = number / (count[owner] - 1)

@@ -23,7 +23,7 @@ def camera_findings(inspection: Inspection, reported: set[tuple[str, int]]) -> l
         rms = np.sqrt(sums / np.maximum(rows, 1))
         usual, typical = float(np.median(rms[seen])), float(np.median(rows[seen]))
         known = np.array([(name, i) in reported for i in range(len(rows))])
-        little = seen & (rows < np.maximum(DIAGNOSIS.few_observations * typical, DIAGNOSIS.min_numbers))
+        little = seen & (rows < np.maximum(DIAGNOSIS.little * typical, DIAGNOSIS.min_numbers))
         large = max(DIAGNOSIS.large_residual * usual, DIAGNOSIS.min_residual)
         found = [
             _suspicious(

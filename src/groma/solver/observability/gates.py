@@ -24,19 +24,16 @@ class DiagnosisGates:
     sample: int = gate(4096, "points", "for the centre and extent of the scene", "cost: time of a diagnosis")
     large_residual: float = gate(3.0, "ratio", "residuals of a camera that stands out, to the usual", _WORDS)
     min_residual: float = gate(1.5, "sigma", "and at least so large", _WORDS)
-    few_observations: float = gate(0.1, "share", "observations of a camera that has few, of the usual", _WORDS)
+    little: float = gate(0.1, "share", "of the usual or largest: observations, motions, extents", _WORDS)
     min_numbers: int = gate(
         12, "numbers", "cameras with fewer measured numbers have few", "derived from 6 unknowns, twice"
     )
     faint: float = gate(10.0, "ratio", "uncertainty of a camera that stands out, to the usual", _WORDS)
-    one_place: float = gate(1e-3, "viewing distances", "camera centres nearer together are one place", _CLASSES)
-    near_one_place: float = gate(0.03, "viewing distances", "and hardly move, if most landmarks suffer", _CLASSES)
     parallax: float = gate(math.radians(3.0), "rad", "angle of rays that determine a point", _CLASSES)
     small_parallax: float = gate(math.radians(0.3), "rad", "the same if its residuals say so", _CLASSES)
     along: float = gate(math.radians(5.0), "rad", "a line runs along a motion; planes through it are one", _CLASSES)
     end_on: float = gate(math.radians(0.5), "rad", "a ray sees a line end-on", _CLASSES)
-    flat: float = gate(1e-3, "share", "least extent of points on one plane, of the next", _CLASSES)
-    max_flat: float = gate(0.1, "share", "but no more of the next extent", _CLASSES)
+    flat: float = gate(1e-3, "share", "of an extent: points on a plane, cameras in one place", _CLASSES)
     most: float = gate(0.9, "share", "of all landmarks: no single one is named", _WORDS)
     visible: float = gate(0.02, "share", "a smaller part of a unit motion is not mentioned", _WORDS)
     axis: float = gate(0.9995, "cosine", "a direction is called an axis of the world", _WORDS)
@@ -44,8 +41,7 @@ class DiagnosisGates:
     whole: float = gate(0.3, "share", "of the cameras in a mode: it is one of the whole", _WORDS)
     largest_motion: float = gate(100.0, "viewing distances", "motions are cut here", "derived from undetermined ones")
     one_by_one: int = gate(4, "variables", "described one by one; of more the names are listed", _WORDS)
-    edge_on: float = gate(0.03, "share", "a camera so near to a plane sees it edge-on", _CLASSES)
-    named: float = gate(0.1, "share", "motion of a parameter that is named, of the largest", _WORDS)
+    edge_on: float = gate(0.03, "share", "a camera so near to a plane sees it edge-on; nearly one place", _CLASSES)
     open_share: float = gate(
         0.01, "share", "singular value of a free direction, of the largest", "derived from rounding"
     )

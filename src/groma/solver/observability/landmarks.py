@@ -186,9 +186,9 @@ def _only_turning(kind: str, seen: Observers, rest: BoolArray, shaky: BoolArray)
     if len(used) < 2 or not affected:
         return None
     spread = _spread(seen.centers[used]) / float(np.median(seen.distance))
-    if spread < DIAGNOSIS.one_place and rest.any():
+    if spread < DIAGNOSIS.flat and rest.any():
         text = f"The cameras only turn: their centres are in one place, so the depth of {kind}s is not determined."
-    elif spread < DIAGNOSIS.near_one_place and affected > 0.5 * len(rest):
+    elif spread < DIAGNOSIS.edge_on and affected > 0.5 * len(rest):
         text = (
             f"The cameras hardly move: their centres are within {spread:.1%} of the viewing distance, and the depth of "
             f"{_so_many(kind, affected, len(rest))} is not determined or uncertain by more than {DIAGNOSIS.weak:.0%}."
@@ -223,7 +223,7 @@ def _flat(inspection: Inspection, name: str, weakness: FloatArray, seen: Observe
     xyz = xyz - xyz.mean(axis=0)
     extent = np.sqrt(np.maximum(np.linalg.eigvalsh(xyz.T @ xyz / len(xyz)), 0.0))
     uncertain = NORMAL.alike * float(np.median(weakness[good] * seen.distance[good]))
-    if not extent[0] < max(DIAGNOSIS.flat * extent[1], min(uncertain, DIAGNOSIS.max_flat * extent[1])):
+    if not extent[0] < max(DIAGNOSIS.flat * extent[1], min(uncertain, DIAGNOSIS.little * extent[1])):
         return []
     return [
         Finding(

@@ -45,7 +45,7 @@ def _cameras(inspection: Inspection, name: str, found: list[tuple[int, FloatArra
         rows = int(inspection.residuals_of_cameras[name][1][i]) if name in inspection.centers else 0
         label = first_upper(inspection.names(name, i))
         text = f"{label} can {camera_freedom(moves, rotations[i])} without the data noticing"
-        text += f"; it has {rows} measured numbers for 6 unknowns." if rows < 12 else "."
+        text += f"; it has {rows} measured numbers for 6 unknowns." if rows < DIAGNOSIS.min_numbers else "."
         findings.append(Finding("camera_unobservable", "problem", text, name, (i,), {"directions": moves.shape[1]}))
     return findings
 
@@ -73,7 +73,7 @@ def _parameters(inspection: Inspection, name: str, found: list[tuple[int, FloatA
     alike: dict[tuple[int, ...], list[int]] = defaultdict(list)
     for i, moves in found:
         size = np.abs(moves).max(axis=1)
-        alike[tuple(np.flatnonzero(size > DIAGNOSIS.named * size.max()).tolist())].append(i)
+        alike[tuple(np.flatnonzero(size > DIAGNOSIS.little * size.max()).tolist())].append(i)
     findings = []
     for which, members in alike.items():
         known = [words[k] for k in which] if words else [f"parameter {k}" for k in which]

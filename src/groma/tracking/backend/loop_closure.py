@@ -71,9 +71,9 @@ def can_be(
     lever = float(np.linalg.norm(centers - centers[-1], axis=1).max())
     away = se3.log(se3.compose(pose[None], se3.inverse(newest.pose[None])))[0]
     many = gates.jump * math.sqrt(newest.index - keyframe.index)
-    turned = math.hypot(gates.turn_sigma, gates.scale_sigma)
+    turned = math.hypot(gates.turn_sigma, gates.shift_sigma)
     went = np.linalg.norm(away[:3]) < many * (gates.shift_sigma * newest.depth + turned * lever)
-    grew = abs(log_scale) < many * gates.scale_sigma
+    grew = abs(log_scale) < many * gates.shift_sigma
     return bool(went and grew and np.linalg.norm(away[3:]) < many * gates.turn_sigma)
 
 

@@ -255,7 +255,7 @@ def _scale(
     second = newer.depths(newest.pose, seen.index[rows[np.asarray(which)[good]]])
     ratio, variance = first[0] - second[0], first[1] + second[1]
     ratio, variance = ratio[np.isfinite(variance)], variance[np.isfinite(variance)]
-    return _common(ratio, variance, gates.loops.min_scales, gates.loops.scale_sigma)
+    return _common(ratio, variance, gates.finding.min_inliers, gates.loops.shift_sigma)
 
 
 def _common(values: FloatArray, variance: FloatArray, least: int, floor: float) -> tuple[float, float] | None:

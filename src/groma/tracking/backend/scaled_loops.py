@@ -69,7 +69,7 @@ def _solved(track_map: TrackMap, loops: list[PlaceAgain], gates: LoopGates) -> S
     ends, known = known_loops(track_map, living)
     new = np.array([(place[loop.keyframe.index], place[loop.newest.index]) for loop in loops])
     every = np.concatenate([np.column_stack([first, second]), ends, new])
-    drift = np.array([gates.shift_sigma] * 3 + [gates.turn_sigma] * 3 + [gates.scale_sigma])
+    drift = np.array([gates.shift_sigma] * 3 + [gates.turn_sigma] * 3 + [gates.shift_sigma])
     sigma = np.tile(drift, (len(every), 1))
     sigma[:, :3] *= np.array([living[k].depth for k in every[:, 1]])[:, None]
     covariance = sigma[:, :, None] ** 2 * np.eye(7)

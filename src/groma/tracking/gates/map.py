@@ -85,8 +85,7 @@ class PlaneGates:
         math.radians(8.0), "rad", "a plane of a keyframe is one of the map within this angle", SEQUENCES
     )
     distance: float = gate(0.08, "scene units", "and distance of the seen part", SEQUENCES)
-    wide_angle: float = gate(math.radians(12.0), "rad", "the same between frames; within it none is new", SEQUENCES)
-    wide_distance: float = gate(0.12, "scene units", "and distance", SEQUENCES)
+    wider: float = gate(1.5, "times", "both, between frames; within them none is new", SEQUENCES)
     merge_angle: float = gate(0.06, "rad", "planes of the map are one within this angle", SEQUENCES)
     merge_distance: float = gate(0.03, "scene units", "and distance", SEQUENCES)
     reach: float = gate(0.6, "scene units", "the seen parts of one plane lie within this distance", SEQUENCES)
@@ -104,9 +103,6 @@ class LandmarkPlaneGates:
     )
     min_views: int = gate(
         2, "images", "that see a landmark (a stereo pair is two); it was followed between them", SEQUENCES
-    )
-    min_support: int = gate(
-        10, "points", "on a plane (a line counts 2)", "derived from the search, which asks for as many"
     )
 
 

@@ -127,14 +127,8 @@ class LoopGates:
     min_matches: int = gate(60, "features", "features that match", SEQUENCES)
     min_inliers: int = gate(35, "features", "features that agree on a pose", SEQUENCES)
     shared: int = gate(30, "points", "a keyframe that shares so much with the new one is no loop", SEQUENCES)
-    shift_sigma: float = gate(0.02, "share", "noise of a relative position, of the median depth", SEQUENCES)
+    shift_sigma: float = gate(0.02, "share", "noise of a relative position, of the median depth, and scale", SEQUENCES)
     turn_sigma: float = gate(0.01, "rad", "noise of a relative rotation", SEQUENCES)
-    min_scales: int = gate(
-        10, "points", "ratios of depths that agree on a scale", "convention: that of poses found by features"
-    )
-    scale_sigma: float = gate(
-        0.02, "1", "noise of the logarithm of a relative scale, of one camera", "derived from that of positions"
-    )
     jump: float = gate(
         6.0, "sigma", "a loop is nearer to the path, on the average of its components: places are alike", SEQUENCES
     )

@@ -339,7 +339,9 @@ def _add_planes(track_map: TrackMap, data: FrameFeatures, pose: FloatArray) -> P
         grow(track_map.planes, int(k), back(pose, seen.places_of(row)), float(seen.support[row]), gates)
     rest = np.setdiff1d(np.arange(len(seen)), rows)
     # No new plane near an existing one that did not agree well enough.
-    _, ambiguous = assign_planes(track_map.planes, seen, pose, gates.wide_angle, gates.wide_distance, gates)
+    _, ambiguous = assign_planes(
+        track_map.planes, seen, pose, gates.wider * gates.angle, gates.wider * gates.distance, gates
+    )
     rest = np.setdiff1d(rest, ambiguous)
     index = np.concatenate([index, add_planes(track_map.planes, seen, rest, pose, gates)])
     rows = np.concatenate([rows, rest])

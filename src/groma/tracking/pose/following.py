@@ -77,7 +77,7 @@ def follow_frame(
     with watch("planes"):
         planes = PlaneMeasurements.empty()
         if planes_found() is not None:
-            planes = match_planes(track_map, data, predicted, gates.planes.wide_angle, gates.planes.wide_distance)
+            planes = match_planes(track_map, data, predicted)
     with watch("lines"):
         lines = LineMeasurements.empty()
         few = len(measured) < gates.lines.few_points

@@ -260,8 +260,7 @@ class _Search:
         """Planes of the frame that agree with a pose; poses are asked again."""
         asked = pose.tobytes()
         if asked not in self._planes:
-            own = self.all_gates.planes
-            self._planes[asked] = match_planes(self.track_map, self.data, pose, own.wide_angle, own.wide_distance)
+            self._planes[asked] = match_planes(self.track_map, self.data, pose)
         return self._planes[asked]
 
     def _is_known(self, start: FloatArray) -> bool:
@@ -370,11 +369,11 @@ def match_lines(
     return followed, table
 
 
-def match_planes(
-    track_map: TrackMap, data: FrameFeatures, pose: FloatArray, angle: float, distance: float
-) -> PlaneMeasurements:
+def match_planes(track_map: TrackMap, data: FrameFeatures, pose: FloatArray) -> PlaneMeasurements:
     """Assign planes of a frame to planes of the map."""
     if data.planes is None:
         return PlaneMeasurements.empty()
-    index, rows = assign_planes(track_map.planes, data.planes, pose, angle, distance, data.options.gates.planes)
+    gates = data.options.gates.planes
+    angle, distance = gates.wider * gates.angle, gates.wider * gates.distance
+    index, rows = assign_planes(track_map.planes, data.planes, pose, angle, distance, gates)
     return PlaneMeasurements(index, data.planes.plane[rows], data.planes.sqrt_information[rows])

@@ -30,7 +30,7 @@ class EarlierGates:
 
     num_points: int = gate(100, "points", "of an image that tell how its epipolar lines moved", "cost: of a quantile")
     moved_share: float = gate(
-        0.1, "share", "of points whose epipolar line moved: search again", "chosen on castle, fountain"
+        0.1, "share", "of points that moved, or their epipolar lines: search again", "chosen on castle, fountain"
     )
 
 
