@@ -17,11 +17,10 @@ Then those with an origin:
 gates
     Fields made by ``gate(...)``, by the first word of their origin.
 stated
-    Numbers of constants whose comment (``#:`` above, or behind) says ``derived from``, ``convention:`` or ``cost:``:
-    sizes of pieces of work, say, on which no decision about data hangs. And defaults of fields that a user is meant to
-    change (options), whose comment says one of these or ``chosen on``.
-
-And what no decision about data hangs on by its nature, each in a column of its own, so that nothing is hidden:
+    Numbers whose comment (above, or behind) says ``derived from``, ``convention:`` or ``cost:``: sizes of pieces of
+    work, say, on which no decision about data hangs. And defaults of fields that a user is meant to change
+    (options), whose comment says one of these or ``chosen on``. And what no decision about data hangs on by its
+    nature, each in a column of its own, so that nothing is hidden:
 
 formats
     Constants whose comment speaks of a *format*; integers in comparisons where files are read (``io``, ``bounded``):
@@ -94,7 +93,8 @@ def numbers_of(path: Path, name: str = "") -> Iterator[Number]:
             words[node.targets[0].id] = node.value.value
     found += _inside(tree, False, words, lines)
     for kind, line, value in found:
-        yield _in_room(kind, name), line, value
+        stated = kind in KINDS and STATED.search(_beside(line, lines))
+        yield "stated" if stated else _in_room(kind, name), line, value
 
 
 def count(root: str | Path) -> dict[str, Counter[str]]:
@@ -141,6 +141,14 @@ def _comment(node: ast.stmt, lines: list[str]) -> str:
         above -= 1
     behind = lines[(node.end_lineno or node.lineno) - 1][node.end_col_offset or 0 :]
     return " ".join(line.lstrip(" #:").rstrip() for line in lines[above : node.lineno - 1]) + behind
+
+
+def _beside(line: int, lines: list[str]) -> str:
+    """Return the comment behind a line, or the lines of one directly above it."""
+    above = line - 1
+    while above > 0 and lines[above - 1].lstrip().startswith("# "):
+        above -= 1
+    return " ".join([*lines[above : line - 1], lines[line - 1].partition("  # ")[2]])
 
 
 def _inside(node: ast.AST, compiled: bool, words: dict[str, object], lines: list[str]) -> Iterator[Number]:

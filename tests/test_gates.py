@@ -121,6 +121,9 @@ def test_numbers_that_no_decision_hangs_on_stand_apart(tmp_path):
 
     assert counted("a/b.py", "#: Rows at once\n#: (cost: memory).\nROWS = 512\n#: Near.\nNEAR = 7\n") == {
         "stated": 1, "named": 1}  # fmt: skip
+    assert counted("a/b.py", "def f(a):\n    return 5.5 * a  # derived from a\n") == {"stated": 1}
+    assert counted("a/b.py", "def f(a):\n    # Derived from\n    # a.\n    b = 5.5 * a\n    return 1.5 * b\n") == {
+        "stated": 1, "floats": 1}  # fmt: skip
     assert counted("a/b.py", "_NONE = 65535  # of the format\n") == {"formats": 1}
     fields = (
         "class Options:\n    #: Steps (chosen on a scene).\n    steps: int = 50\n    #: Length.\n    size: int = 9\n"

@@ -30,6 +30,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+#: Standard deviation of normal noise over the median of its absolute values (derived from its distribution).
+SIGMA_OF_MEDIAN = 1.4826
 #: How the origin of a number may begin.
 ORIGINS = ("derived from", "chosen on", "convention:", "cost:")
 #: Origins that many numbers share: the data that they were chosen on.

@@ -35,7 +35,7 @@ from groma.solver.independent import STRETCH
 #: Steps under one loss, the relative decrease of the cost that ends them, and the first damping.
 MAX_STEPS, TOLERANCE, FIRST_DAMPING = 8, 1e-3, 1e-6
 _SHORTER, _LONGER, _MOST, _LOWERED = STRETCH.shorter, STRETCH.longer, STRETCH.most, STRETCH.lowered
-_SIX = (None,) * 6
+_SIX = (None,) * 6  # derived from the numbers of a motion
 _CHART = POSE_CHARTS["left"]
 
 

@@ -33,7 +33,8 @@ _JUDGES = 64
 _DRAWN_AT_ONCE, _SCORED_AT_ONCE, _PIECES = 1024, 256, 32
 
 
-#: Where the entries of a covariance, and those of its diagonal, are among the packed ones.
+#: Where the entries of a covariance, and those of its diagonal, are among the packed ones (derived from
+#: their order).
 _UNPACKED, _DIAGONAL = [0, 1, 2, 1, 3, 4, 2, 4, 5], [0, 3, 5]
 
 

@@ -15,7 +15,7 @@ class PlaneOptions:
     level: float = 0.95
     #: Least number of points; a segment counts as two.
     min_support: int = 10
-    #: Largest standard deviation of the normal, radians. Two degrees (convention): narrow faces, such as those of legs
+    #: Largest standard deviation of the normal, radians (convention: two degrees): narrow faces, such as those of legs
     #: and boards, are known no better. Round bodies and walls have the same planes with half a degree to two.
     max_tilt: float = 0.035
     #: Least part of the features in the layer around a plane that lie on it.

@@ -71,7 +71,7 @@ class DirectionOptions:
     max_false_alarms: float = 1e-4
     #: Most directions (cost: time).
     max_directions: int = 24
-    #: Directions whose standard deviation is larger are dropped, radians. 2 degrees.
+    #: Directions whose standard deviation is larger are dropped, radians (convention: two degrees).
     max_sigma: float = 0.035
     #: Random seed of the candidates.
     seed: int = 0

@@ -19,6 +19,7 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.errors import InputError, ShapeError
 from groma.estimators._plane_loops import fit_loop
+from groma.estimators._plane_options import PLANE_SEARCH
 from groma.geometry.algebra import perpendicular, vectors
 
 #: Root of the information about what points do not determine; the square of its inverse is still finite.
@@ -38,7 +39,10 @@ class PlaneFit:
 
 
 def fit_plane(
-    points: FloatArray, covariances: FloatArray, weights: FloatArray | None = None, iterations: int = 10
+    points: FloatArray,
+    covariances: FloatArray,
+    weights: FloatArray | None = None,
+    iterations: int = PLANE_SEARCH.fit_rounds,
 ) -> PlaneFit:
     r"""Fit one plane to points by weighted least squares.
 

@@ -164,7 +164,7 @@ def unrelated(distance: FloatArray, centers: FloatArray, angle_deg: FloatArray) 
     if len(distance) < 3 or float(angle_deg.mean()) <= SCORES.unrelated_deg:
         return None
     spread = float(np.sum((centers - centers.mean(axis=0)) ** 2))
-    left = 100.0 * float(np.sum(distance**2)) / spread if spread > 0.0 else 100.0
+    left = 100.0 * (float(np.sum(distance**2)) / spread if spread > 0.0 else 1.0)
     return (
         f"The alignment leaves {angle_deg.mean():.0f} deg between the orientations on average, and {left:.2g} % of the "
         "spread of the centres: the two seem unrelated (another scene, other frames), or their cameras have other axes."

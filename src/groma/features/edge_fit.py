@@ -39,7 +39,7 @@ from groma._numba import inline_kernel, kernel, loop
 from groma._ordering import median
 from groma._typing import FloatArray
 from groma.features.images import GrayImage, SmoothImage, smoothed
-from groma.gates import NORMAL, gate, numbers
+from groma.gates import NORMAL, SIGMA_OF_MEDIAN, gate, numbers
 
 #: Samples across the segment reach this far on either side, pixels: the size of an array.
 REACH = 3
@@ -167,7 +167,7 @@ def _robust_line(s, e, w, spread, n, outlier, line):
     for _ in range(4):
         for k in range(n):
             spread[k] = abs(e[k] - line[0] - line[1] * s[k])
-        cut = outlier * max(1.4826 * median(spread[:n]), 0.05)
+        cut = outlier * max(SIGMA_OF_MEDIAN * median(spread[:n]), 0.05)
         for k in range(n):
             ratio = spread[k] / cut
             w[k] = (1.0 - ratio * ratio) ** 2 if ratio < 1.0 else 0.0
@@ -198,6 +198,7 @@ def _end_sigma(s, e, w, n, line, numbers):
     bow /= max(bows, 1e-12)
     if bow * bow * bows < _BOW * variance * (weight / effective):
         bow = 0.0
+    # Derived from a line through samples spread evenly: its ends have four times the variance of its middle.
     return math.sqrt(min_sigma**2 + 4.0 * variance / effective + (bow / 6.0) ** 2)
 
 

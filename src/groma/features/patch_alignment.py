@@ -38,7 +38,7 @@ from groma.gates import STRECHA, gate, numbers
 from groma.geometry.algebra import as_rows
 
 RADIUS = 7  # of the template, pixels
-SIZE = 2 * RADIUS + 3  # side of a template: the patch and one pixel more for its gradient
+SIZE = 2 * RADIUS + 3  # side of a template, derived from the patch and one pixel more for its gradient
 _SIDE = 2 * RADIUS + 1
 _COUNT = _SIDE**2
 

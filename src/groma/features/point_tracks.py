@@ -19,7 +19,7 @@ import numpy as np
 from groma._numba import loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.features.images import GrayImage
-from groma.gates import gate
+from groma.gates import SIGMA_OF_MEDIAN, gate
 
 _HALF = np.float32(0.5)
 
@@ -46,7 +46,7 @@ class PointTrackGates:
     @property
     def noise_eigenvalue(self) -> float:
         """Mean eigenvalue that noise of one grey level makes: 12 times the samples, by 4, the width and 255."""
-        return 12.0 * self.block**2 / (4.0 * self.block * 255.0) ** 2
+        return 12.0 * self.block**2 / (4.0 * self.block * 255.0) ** 2  # derived from Sobel's weights
 
 
 #: The numbers in use.
@@ -209,4 +209,4 @@ def image_noise(image: GrayImage) -> float:
     size = np.abs(cv2.filter2D(image, cv2.CV_16S, kernel)[::2, ::2]).ravel()
     # They are whole numbers: the median is where half of them are counted.
     below, middle = np.cumsum(np.bincount(size)), [(len(size) - 1) // 2, len(size) // 2]
-    return 1.4826 / 6.0 * float(np.searchsorted(below, middle, side="right").mean())
+    return SIGMA_OF_MEDIAN / 6.0 * float(np.searchsorted(below, middle, side="right").mean())

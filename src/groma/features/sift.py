@@ -33,13 +33,14 @@ from groma.features.images import GrayImage
 
 #: Maximum pixels of an image processed as a whole, and sides of the tiles of others (cost: memory and time).
 AT_ONCE, TILE = 2**21, 1216
-#: Pixels around a tile that what is found there depends on, and some more. Pixels of the doubled image: 34 by the
-#: filters up to the layer from which the second octave is made; there, twice 29 by those up to the last layer that is
-#: described, twice 38 by the largest descriptor and twice 5 by steps towards a peak: together 178, of the image 89.
-#: (Places of a diameter of 8 pixels, for which nothing is doubled: 6 by the filter, 43 by the descriptor.) A multiple
-#: of 16, as the sides, so that a pixel is computed by the same instructions as in the whole image.
+#: Pixels around a tile that what is found there depends on, and some more, derived from the method. Pixels of the
+#: doubled image: 34 by the filters up to the layer from which the second octave is made; there, twice 29 by those up
+#: to the last layer that is described, twice 38 by the largest descriptor and twice 5 by steps towards a peak:
+#: together 178, of the image 89. (Places of a diameter of 8 pixels, for which nothing is doubled: 6 by the filter,
+#: 43 by the descriptor.) A multiple of 16, as the sides, so that a pixel is computed by the same instructions as in
+#: the whole image.
 _AROUND, _STEP = 96, 16
-#: Where OpenCV's places lie from the true ones because of the doubled image, pixels (derived: see above).
+#: Where OpenCV's places lie from the true ones because of the doubled image, pixels (derived from halving it).
 _DOUBLED = np.array([-0.25, -0.25])
 #: Diameter of places that come without one, pixels (convention: half of a patch of SIFT's finest scale).
 PLACE_SIZE = 8.0

@@ -96,7 +96,7 @@ def _add(x, B, step, out):
 #: Unknowns: grey level, logarithm of the blur; height, offset and tilt of each step.
 _ONE = problem_kind(2, 5, 1, (1,), _blur, _residual, _add)
 _TWO = problem_kind(3, 8, 1, (1,), _blur, _residual, _add)
-#: What observations tell: a grey level; or a sum of unknowns that is known beforehand.
+#: What observations tell: a grey level; or a sum of unknowns that is known beforehand (derived from their order).
 _KNOWN = np.array([[0] * 8, [0, 1] + [0] * 6, [0, 0, 0, 0, 1, 0, 0, 0], [0, 0, 0, 0, -1, 0, 0, 1]], np.float64)
 
 

@@ -33,7 +33,7 @@ from groma.io.pose_conventions import EUROC, KITTI, TUM
 from groma.io.reading import existing, reading
 from groma.scene.table import Table, column
 
-#: Lines of a pose in a .log: its numbers, and a matrix of 4x4.
+#: Lines of a pose in the format .log: its numbers, and a matrix of 4x4.
 _LOG_LINES = 5
 
 #: Lines with content, and their numbers.

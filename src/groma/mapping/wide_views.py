@@ -81,7 +81,7 @@ class WideViews:
         _, by_ray, _ = model.project_jacobian(params, rays)
         focal = float(np.median(np.linalg.svd(by_ray, compute_uv=False)[:, 1]))
         side = (rays @ _AXES.T).argmax(axis=1)
-        reach = np.tan(np.radians(45.0 + GATES.overlap))
+        reach = np.tan(np.radians(45.0 + GATES.overlap))  # derived from a cube
         turns, pinhole, sizes = [], [], []
         for k in np.flatnonzero(np.bincount(side, minlength=len(_AXES)) >= GATES.min_share * len(rays)):
             turn = np.stack([_RIGHT[k], np.cross(_AXES[k], _RIGHT[k]), _AXES[k]])

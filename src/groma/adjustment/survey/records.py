@@ -13,10 +13,7 @@ from typing import Any
 import numpy as np
 import scipy  # its parts are imported when something of them is first used
 
-from groma.gates import NORMAL, gate
-
-#: The median of the size of a standard normal number (derived from its distribution).
-_MEDIAN = 0.6745
+from groma.gates import NORMAL, SIGMA_OF_MEDIAN, gate
 
 
 @dataclass(frozen=True)
@@ -147,7 +144,7 @@ def gross_errors(measurements: Sequence[Measurement]) -> dict[tuple[str, int], f
     found: dict[tuple[str, int], float] = {}
     for kind in dict.fromkeys(kind for kind, _, _ in tests):
         sizes = [(place, size) for of, place, size in tests if of == kind]
-        shown = float(np.median([size for _, size in sizes])) / _MEDIAN if len(sizes) >= GATES.few else 1.0
+        shown = SIGMA_OF_MEDIAN * float(np.median([size for _, size in sizes])) if len(sizes) >= GATES.few else 1.0
         for place, size in sizes:
             if size > limit * max(1.0, shown):
                 found[place] = max(size, found.get(place, 0.0))

@@ -126,7 +126,7 @@ def _triples(count: int):
 
 def _small_sample(count: int) -> float:
     """Rousseeuw's correction of the scale of few residuals; a similarity takes seven of three for each point."""
-    return 1.0 + 5.0 / max(count - 7 / 3, 1.0)
+    return 1.0 + 5.0 / max(count - 7 / 3, 1.0)  # convention: Rousseeuw and Leroy 1987
 
 
 def _of(x: FloatArray, y: FloatArray) -> Similarity | None:

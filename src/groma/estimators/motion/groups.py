@@ -66,7 +66,7 @@ def _coordinates(kind: Kind, near_identity: FloatArray) -> FloatArray:
     """Coordinates (k,) of a matrix (4, 4) near a multiple of the identity."""
     basis = generators(kind).reshape(-1, 16)
     if kind == "projective":
-        near_identity = near_identity * (4.0 / np.trace(near_identity))
+        near_identity = near_identity * (4.0 / np.trace(near_identity))  # derived from the identity
         basis = np.concatenate([basis, np.eye(4).reshape(1, 16)])
     found = np.linalg.lstsq(basis.T, (near_identity - np.eye(4)).ravel(), rcond=None)[0]
     return np.asarray(found[: FREEDOM[kind]], np.float64)

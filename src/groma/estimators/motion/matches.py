@@ -186,7 +186,7 @@ class Prepared:
         of_a, of_b = (matches.point_sigma**2).T
         variance = of_a * (D**2).sum(axis=(-2, -1)) / 3.0 + of_b
         points = ((y - matches.points_in_b) ** 2).sum(axis=-1) / variance
-        points += 3.0 * np.maximum(np.log(variance / (of_a + of_b)), 0.0)
+        points += 3.0 * np.maximum(np.log(variance / (of_a + of_b)), 0.0)  # derived from three coordinates
         return np.nan_to_num(np.concatenate([lines.sum(axis=-1), points], axis=-1), nan=np.inf)
 
     def linearised(self, kind: Kind, motion: FloatArray) -> list[tuple[FloatArray, FloatArray]]:

@@ -47,7 +47,7 @@ class PlaneSearchOptions:
     #: Maximum number of planes, the largest (cost: time).
     max_planes: int = 16
     #: Largest mean squared whitened distance of a block from the plane that grows over it.
-    gate: float = 3.0
+    gate: float = NORMAL.far
     #: Normals of neighbours that differ by less are always joined, degrees; noise is allowed on top.
     angle_deg: float = 8.0
     #: Depth cameras bend planes: what lies within this share of the depth is one plane.

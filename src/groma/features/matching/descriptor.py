@@ -34,9 +34,9 @@ from groma.features.segments import Segments
 from groma.gates import STRECHA, gate
 
 Descriptors = npt.NDArray[np.float32]
-#: Bands beside a segment: with it the size of a descriptor.
+#: Bands beside a segment, with eight numbers each (convention: LBD, Zhang and Koch 2013).
 BANDS = 9
-DESCRIPTOR_SIZE = 8 * BANDS
+DESCRIPTOR_SIZE = 8 * BANDS  # convention: as above
 
 
 @dataclass(frozen=True)

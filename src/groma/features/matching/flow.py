@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 Flow = npt.NDArray[np.float32]
-MIN_IMAGE = 16  # pixels; smaller images give DIS no patch to compare
+#: Smaller images give DIS no patch to compare, pixels (derived from its patches of 8, in an image of half the size).
+MIN_IMAGE = 16
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,8 @@ from groma.gates import gate
 #: Rows of the table of descriptor products held in memory (cost: memory).
 ROWS_AT_ONCE = 512
 _SURVEYED = "chosen on Strecha's surveyed scenes"
-#: Format of a row: descriptor distance; points for, against, near one only; overlap on first, on second (-1: unknown).
+#: Columns of a row, whose format is: descriptor distance; points for, against, near one only; overlap on first, on
+#: second (-1: unknown).
 FEATURES = 6
 
 

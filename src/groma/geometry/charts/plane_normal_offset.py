@@ -69,7 +69,7 @@ class NormalOffsetPlane(Chart):
         state, other = self._checked_pair(state, other)
         n = state[:, :3]
         cosine = np.sum(n * other[:, :3], axis=1)
-        sign = np.where(cosine < -0.6, -1.0, 1.0)  # cos(2 atan 2), as for the charts of lines
+        sign = np.where(cosine < -0.6, -1.0, 1.0)  # derived from cos(2 atan 2), as for the charts of lines
         goal = sign[:, None] * other
         b = np.stack(perpendicular(n), axis=1)
         tangent = (b @ goal[:, :3, None])[:, :, 0]

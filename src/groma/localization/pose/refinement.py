@@ -177,6 +177,7 @@ def _pull(residual: FloatArray, unknowns: int) -> tuple[FloatArray, float]:
     noise = residual * np.sqrt(residual.size / max(free, 1))
     square = (noise**2).sum(axis=1, keepdims=True)
     of_noise = (1.0 + square / c) ** -2
+    # Derived from the loss: the derivative of what it pulls with.
     stiffness = of_noise - 4.0 * noise**2 / c * (1.0 + square / c) ** -3
     mean = max(float(stiffness.mean()), float(of_noise.mean()) ** 2)  # of far outliers the former may vanish
     shown = float(((of_noise * noise) ** 2).mean()) / mean**2
@@ -339,7 +340,7 @@ def _noise(found: tuple[Residuals, Residuals], matches: Matches, max_error: tupl
     together = np.concatenate(squares)
     if not len(together):
         return 1.0
-    free = max(1.0 - 3.0 / len(together), 0.1)  # six of two times so many numbers went into the pose
+    free = max(1.0 - 3.0 / len(together), 0.1)  # derived from six of two times so many numbers
     shown = float(np.median(together)) / (chi_square_gate(0.5, 2) * free)
     return float(
         np.sqrt((REFINEMENT.stated_weight + len(together) * shown) / (REFINEMENT.stated_weight + len(together)))

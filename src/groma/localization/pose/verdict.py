@@ -202,7 +202,7 @@ def doubted_if_other_lens(verdict: Verdict, step: LensStep) -> Verdict:
 
     if verdict.status != "localized":
         return verdict
-    if step.shift > VERDICT.shift and chdtrc(3.0, step.square) < 1.0 - VERDICT.whole:
+    if step.shift > VERDICT.shift and chdtrc(3.0, step.square) < 1.0 - VERDICT.whole:  # derived from three
         why = (
             "a principal point far from where it should be better: the photograph may be cropped, or put together of "
             "pieces."

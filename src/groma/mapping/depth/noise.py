@@ -20,8 +20,7 @@ import numpy as np
 from groma._typing import FloatArray, IntArray
 from groma.features.depth.noise import DepthNoise
 from groma.features.depth.points import DEPTH_POINTS
-from groma.gates import NORMAL, gate
-from groma.mapping.depth.unit import ROBUST
+from groma.gates import NORMAL, SIGMA_OF_MEDIAN, gate
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ def fitted_noise(depth: FloatArray, difference: FloatArray, sigma: FloatArray) -
         for rows in np.array_split(np.argsort(depth), NOISE.groups)
     ]
     middle = np.array([np.median(depth[rows]) for rows in groups])
-    spread = ROBUST * np.array([np.median(np.abs(difference[rows])) for rows in groups])
+    spread = SIGMA_OF_MEDIAN * np.array([np.median(np.abs(difference[rows])) for rows in groups])
     spread = np.maximum(spread, NOISE.least * middle)  # with what the points err by: rather too much than too little
     from scipy.optimize import nnls  # takes 0.2 s to import
 

@@ -15,10 +15,10 @@ from groma._typing import FloatArray, IntArray
 from groma.execution import map_work
 from groma.features.depth.lines import DepthLineGates, fit_depth_lines
 from groma.features.depth.noise import DepthNoise
+from groma.gates import SIGMA_OF_MEDIAN
 from groma.geometry import quaternion
 from groma.io.depth_maps import DepthMaps
 from groma.mapping.depth.points import MeasuredDepths, image_sizes, read_map
-from groma.mapping.depth.unit import ROBUST
 from groma.scene import LineDepths, Scene
 from groma.scene.line_intervals import shares_on_lines
 
@@ -113,4 +113,4 @@ def _misfit(difference: FloatArray, sigma: FloatArray) -> float:
     """
     away = np.abs(difference / sigma)
     away = away[np.isfinite(away)]
-    return max(1.0, ROBUST * float(np.median(away))) if len(away) else 1.0
+    return max(1.0, SIGMA_OF_MEDIAN * float(np.median(away))) if len(away) else 1.0

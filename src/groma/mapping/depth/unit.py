@@ -15,11 +15,7 @@ import numpy as np
 from groma._counted import counted, first_of
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
-from groma.gates import NORMAL, gate
-
-#: A median absolute deviation of normal noise times this is a standard deviation (derived from the normal
-#: distribution).
-ROBUST = 1.4826
+from groma.gates import NORMAL, SIGMA_OF_MEDIAN, gate
 
 
 @dataclass(frozen=True)
@@ -65,7 +61,7 @@ def common_unit(ratio: FloatArray, image_idx: IntArray, known: bool) -> tuple[fl
     level = np.log(ratio[told])
     unit, warnings = float(np.exp(np.median(level))), []
     own = np.array([np.median(level[image_idx[told] == i]) for i in np.unique(image_idx[told])])
-    scatter = ROBUST * float(np.median(np.abs(own - np.median(own))))
+    scatter = SIGMA_OF_MEDIAN * float(np.median(np.abs(own - np.median(own))))
     if scatter > UNITS.different:
         warnings.append(
             f"The depth maps do not agree on a unit: their scales differ by {np.expm1(scatter):.0%} from map to map. "
@@ -112,7 +108,7 @@ def own_units(
 
 
 def _spread(values: FloatArray) -> float:
-    return ROBUST * float(np.median(np.abs(values - np.median(values))))
+    return SIGMA_OF_MEDIAN * float(np.median(np.abs(values - np.median(values))))
 
 
 def _growth(first: FloatArray, second: FloatArray) -> float:

@@ -22,6 +22,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_in_threads
 from groma.gates import LINE_MAPS, gate
 from groma.geometry import quaternion
+from groma.mapping.lines.options import MapLinesOptions
 from groma.scene import Scene
 
 if TYPE_CHECKING:
@@ -42,7 +43,9 @@ class NeighborGates:
 GATES = NeighborGates()
 
 
-def covisible_neighbors(scene: Scene, num_neighbors: int, min_shared: int = 8) -> list[IntArray]:
+def covisible_neighbors(
+    scene: Scene, num_neighbors: int, min_shared: int = MapLinesOptions.min_shared
+) -> list[IntArray]:
     """Choose for every image its neighbours, best first.
 
     Parameters

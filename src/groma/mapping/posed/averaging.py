@@ -149,7 +149,7 @@ def _reweighted(
         noise = max(float(np.median(np.linalg.norm(own[counts], axis=1))), 1e-9) if counts.any() else 1.0
     for step in range(1, GATES.steps + 1):
         ratio = np.linalg.norm(off, axis=1) / sigma
-        # Of repeated structure most motions are wrong: the quartile, not the median.
+        # Of repeated structure most motions are wrong (convention: the quartile, not the median).
         spread = max(1.0, float(np.sqrt(np.quantile(ratio**2, 0.25) / chi_square_gate(0.75, 3))))
         # A pose that claims to be far better than the motions would outvote any number of them.
         used = max(noise, spread * float(np.median(sigma * length)))

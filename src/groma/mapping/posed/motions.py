@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.gates import gate
+from groma.gates import SIGMA_OF_MEDIAN, gate
 from groma.geometry import quaternion
 from groma.io.colmap.at_poses import MatchedPair
 
@@ -82,7 +82,7 @@ def _refined(pair: MatchedPair) -> tuple[FloatArray, float, float]:
     noise, normal = least, np.eye(5)
     for _ in range(GATES.steps):
         residual, jacobian, basis = _linearised(pose, pair.first_rays, pair.second_rays)
-        noise = max(least, 1.4826 * float(np.median(np.abs(residual))))
+        noise = max(least, SIGMA_OF_MEDIAN * float(np.median(np.abs(residual))))
         weight = 1.0 / (1.0 + (residual / (2.0 * noise)) ** 2)
         normal = (jacobian * weight[:, None]).T @ jacobian
         step = -np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(5), jacobian.T @ (weight * residual))

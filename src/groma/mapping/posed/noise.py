@@ -58,7 +58,7 @@ def noise_of_given(squared: FloatArray, redundancy: FloatArray) -> GivenNoise:
         return GivenNoise(None, gross)
     order = usable[np.argsort(squared[usable] / redundancy[usable], kind="stable")]
     ratio = squared[order] / redundancy[order]
-    total, freedom = np.cumsum(squared[order]), 3.0 * np.cumsum(redundancy[order])
+    total, freedom = np.cumsum(squared[order]), 3.0 * np.cumsum(redundancy[order])  # derived from three coordinates
     count = len(order)
     half, k, variance = (count + 2) // 2, count, 0.0
     for k in range(half, count + 1):

@@ -196,7 +196,7 @@ def _compared(poses: FloatArray, covariance: FloatArray, known: GivenPoses) -> G
     between = se3.log(se3.compose(poses, se3.inverse(known.poses)))
     told, sigma = [], []
     for part, before in zip((slice(0, 3), slice(3, 6)), known.sigma, strict=True):
-        share = np.einsum("nii->n", covariance[:, part, part]) / (3.0 * before**2)
+        share = np.einsum("nii->n", covariance[:, part, part]) / (3.0 * before**2)  # derived from three coordinates
         # What took part shows less than its error; what did not shows that of the adjusted pose too.
         redundancy = np.where(known.gross, 1.0 + share, np.clip(1.0 - share, 0.0, 1.0))
         redundancy = np.where(np.isfinite(redundancy), redundancy, 0.0)

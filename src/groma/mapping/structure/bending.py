@@ -27,7 +27,7 @@ from groma.geometry.algebra import perpendicular
 from groma.mapping.structure.relations import Landmarks, Pairs
 from groma.mapping.structure.rough_planes import deviations, members_of
 
-#: Quarters of a plane, what a fit of one takes, and the slopes of all.
+#: Quarters of a plane, what a fit of one takes, and the slopes of all (derived from halves along two axes).
 _QUARTERS, _UNKNOWNS, _SLOPES = 4, 3, 8
 
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.adjustment.assemble import assemble
-from groma.gates import NORMAL
+from groma.gates import NORMAL, SIGMA_OF_MEDIAN
 from groma.problem.problem import Problem
 from groma.problem.residuals import squared_norms
 from groma.solver.options import SolverOptions
@@ -39,8 +39,6 @@ from groma.tracking.options import TrackOptions
 
 #: Step of the differences of costs, of the deviation known beforehand.
 _STEP = 0.05
-#: Half of all values that are distributed normally are within so many standard deviations (belongs to mathematics).
-MEDIAN_OF_NORMAL = 0.6745
 
 
 @dataclass(frozen=True)
@@ -115,12 +113,12 @@ def depths_that_do_not_fit(track_map: TrackMap, gates: DepthGates) -> list[str]:
         off.append(np.abs(depth - table.depth[told]) / table.depth_sigma[told])
     every = np.concatenate(off)
     median = float(np.median(every)) if len(every) >= NORMAL.sample else 0.0
-    if median <= gates.max_misfit * MEDIAN_OF_NORMAL:
+    if SIGMA_OF_MEDIAN * median <= gates.max_misfit:
         return []
     return [
         f"Depths and images disagree: half of the depths are more than {median:.1f} standard deviations from where the "
-        f"images have their points ({MEDIAN_OF_NORMAL:.1f} expected). Check that depths belong to the pixels of the "
-        "images, and are of the same time."
+        f"images have their points ({1.0 / SIGMA_OF_MEDIAN:.1f} expected). Check that depths belong to the pixels of "
+        "the images, and are of the same time."
     ]
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assemble import assemble, first_camera_gauge
 from groma.adjustment.assembly_options import AssemblyOptions
-from groma.gates import NORMAL
+from groma.gates import NORMAL, SIGMA_OF_MEDIAN
 from groma.geometry import se3
 from groma.problem.problem import Problem
 from groma.scene import Lines, Relations, Scene
@@ -136,7 +136,7 @@ class AdjustmentJob:
             return
         column = self.camera.project(at[found] - [self.camera.baseline, 0.0, 0.0])[:, 0]
         error = np.abs(column - table.right[found, 0]) / table.sigma[found]
-        limit = GATE * max(1.4826 * float(np.nanmedian(error)), LEAST_NOISE)
+        limit = GATE * max(SIGMA_OF_MEDIAN * float(np.nanmedian(error)), LEAST_NOISE)
         wrong = found[~(error <= limit)]
         for k in np.unique(self.point_pose[wrong]):
             keyframe = self.keyframes[k]

@@ -26,7 +26,7 @@ from groma.tracking.frame.camera import TrackCamera, into, rotation
 from groma.tracking.gates import DEFAULT, TurnGates
 
 SmallImage = npt.NDArray[np.float32]
-_THREE = (None,) * 3
+_THREE = (None,) * 3  # derived from the numbers of a turn
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels

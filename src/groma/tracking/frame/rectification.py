@@ -24,7 +24,7 @@ from groma._typing import FloatArray
 from groma.errors import InputError
 from groma.features.images import GrayImage
 from groma.features.point_tracks import POINT_TRACKS, follow
-from groma.gates import NORMAL
+from groma.gates import NORMAL, SIGMA_OF_MEDIAN
 from groma.geometry import so3
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.stereo import Disparities
@@ -255,12 +255,12 @@ def fit_rows(
         weighted = basis / (1.0 + share[:, None]) ** 2
         angles = np.linalg.solve(weighted.T @ basis + loose, weighted.T @ offset)
         error = offset - basis @ angles
-        scale = max(1.4826 * float(np.median(np.abs(error))), _LEAST_SCALE)
+        scale = max(SIGMA_OF_MEDIAN * float(np.median(np.abs(error))), _LEAST_SCALE)
         share = (error / (NORMAL.far * scale)) ** 2
     # The covariance of a robust estimate from independent sums: how they push, by how the push changes with the angles.
     push = basis * (error / (1.0 + share) ** 2)[:, None]
     pushes = np.stack([np.bincount(cells, weights=column) for column in push.T], axis=1)
-    slope = (1.0 - 3.0 * share) / (1.0 + share) ** 3
+    slope = (1.0 - 3.0 * share) / (1.0 + share) ** 3  # derived from the push, by the error
     inverse = np.linalg.inv((basis * slope[:, None]).T @ basis + loose)
     covariance = inverse @ (pushes.T @ pushes) @ inverse * count / (count - 3)
     kept = [0, 2]

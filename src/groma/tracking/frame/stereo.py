@@ -31,7 +31,7 @@ def dense_disparities(left: GrayImage, right: GrayImage, gates: StereoGates = DE
     matcher.setTextureThreshold(gates.texture)
     # OpenCV leaves out the columns at the left whose counterpart could be outside, and rounds sixteenths of a pixel up.
     wide = [cv2.copyMakeBorder(image, 0, 0, count, 0, cv2.BORDER_REPLICATE) for image in (left, right)]
-    found = (matcher.compute(wide[0], wide[1])[:, count:].astype(np.float32) - 0.5) / 16.0
+    found = (matcher.compute(wide[0], wide[1])[:, count:].astype(np.float32) - 0.5) / 16.0  # derived from those
     column = np.arange(left.shape[1], dtype=np.float32)
     return np.where((found > 0.5) & (found < column - gates.block // 2), found, np.float32(0.0))
 

@@ -175,7 +175,7 @@ def _noise_scale(tracks: Tracks) -> float:
     rows, number = rows[many], number[many]
     if len(rows) < tracks.gates.min_residuals:
         return 1.0
-    freedom = 2.0 - 4.0 / number
-    spread = 2.0 / (9.0 * freedom)
+    freedom = 2.0 - 4.0 / number  # derived from the four numbers of a line
+    spread = 2.0 / (9.0 * freedom)  # derived from the cube root: Wilson and Hilferty 1931
     expected = freedom * (1.0 - spread + scipy.special.ndtri(tracks.gates.noise_quantile) * np.sqrt(spread)) ** 3
     return float(np.sqrt(np.quantile(tracks.squared[rows] / expected, tracks.gates.noise_quantile)))
