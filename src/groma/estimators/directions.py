@@ -46,9 +46,6 @@ class DirectionGates:
     wider: float = gate(4.0, "1", "factor of the squared gate in the refinement", "chosen on synthetic rooms")
     max_move: float = gate(0.05, "rad", "longest step of the refinement", "derived from linearity")
     parallel: float = gate(8.7e-4, "rad", "that exact directions deviate", "convention: 0.05 degrees")
-    orthogonal_sigma: float = gate(
-        2.6e-3, "rad", "of right angles", "derived from parallel ones, times three: 0.15 degrees"
-    )
     max_orthogonal_sigma: float = gate(0.01, "rad", "of right angles that tell something", "chosen on synthetic rooms")
 
 
@@ -196,7 +193,7 @@ def directions_from_lines(
 
 
 def orthogonal_pairs(
-    directions: FloatArray, covariance: FloatArray, sigma: float = DIRECTIONS.orthogonal_sigma
+    directions: FloatArray, covariance: FloatArray, sigma: float = NORMAL.far * DIRECTIONS.parallel
 ) -> IntArray:
     r"""Pairs of directions that are orthogonal within their uncertainty.
 

@@ -44,7 +44,6 @@ class MotionGates:
     longest: float = gate(10.0, "1", "norm of a step, else the refinement is given up", "cost: it has gone astray")
     converged: float = gate(1e-3, "1", "gain of chi square that ends it", "derived from the variance of a chi square")
     damped: float = gate(10.0, "times", "less damping after a step that helped, more after another", "cost: steps")
-    odds: float = gate(9.2, "1", "least gain over another motion", "derived from 2 log of odds of 100 to 1")
     elsewhere: float = gate(0.2, "1", "median shift of places by another motion, of their extent", "cost: of refining")
     apart: float = gate(100.0, "1", "squared distance of different motions, in sigma", "convention: ten sigma")
     feigned: float = gate(0.5, "share", "of information that noise may feign", "derived from 1 where nothing else is")
@@ -255,9 +254,10 @@ class _Search:
         normal, least = self.information(best, self.prepared), self._truncated(best)
         away = self.prepared.places(proposals) - self.prepared.places(best[None])
         far = proposals[np.median(np.linalg.norm(away, axis=-1), axis=-1) > self.gates.elsewhere]
+        even = chi_square_gate(NORMAL.false_alarm, 2)  # twice the logarithm of the odds
         for other in [self._refined(one) for one in far[: self.gates.refined]]:
             apart = tangent_between(self.kind, best, other)
-            if self._truncated(other) - least < self.gates.odds and apart @ normal @ apart > self.gates.apart:
+            if self._truncated(other) - least < even and apart @ normal @ apart > self.gates.apart:
                 why = why_open(self.prepared.matches.take(self.agreeing(best)), self.kind)
                 raise InputError(f"Two {self.kind} motions fit the matches equally well: {why}")
 

@@ -77,7 +77,6 @@ class VerdictGates:
     focal: float = gate(
         0.01, "share", "of the focal length: a step of its estimate that tells another lens", "convention: a hundredth"
     )
-    focal_noise: float = gate(3.3, "sigma", "that such a step must have", "derived from `right`: 1 in 1000")
     shift: float = gate(
         0.05, "focal lengths", "of an estimated principal point from the one that was given, if it is to be told",
         "convention: lenses are centred to some hundredths",

@@ -35,7 +35,7 @@ import numpy as np
 
 from groma._counted import counted
 from groma._typing import BoolArray, FloatArray
-from groma.gates import NORMAL
+from groma.gates import NORMAL, chi_square_gate
 from groma.geometry import se3
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.gates import VERDICT
@@ -207,7 +207,7 @@ def doubted_if_other_lens(verdict: Verdict, step: LensStep) -> Verdict:
             "a principal point far from where it should be better: the photograph may be cropped, or put together of "
             "pieces."
         )
-    elif abs(step.focal) > max(VERDICT.focal, VERDICT.focal_noise * step.focal_sigma):
+    elif abs(step.focal) > max(VERDICT.focal, math.sqrt(chi_square_gate(1.0 - VERDICT.right, 1)) * step.focal_sigma):
         why = (
             f"a {'longer' if step.focal > 0.0 else 'shorter'} focal length better: the calibration is not that of this "
             "photograph. Pass its own, or let it be estimated (--calibration unknown)."

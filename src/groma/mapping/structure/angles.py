@@ -32,7 +32,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.estimators._parallel_lines import PARALLEL
 from groma.estimators.directions import DIRECTIONS, DirectionSet
 from groma.estimators.membership import Candidates, averaged_memberships
 from groma.estimators.plane_search import PlaneSet
@@ -63,12 +62,7 @@ class AngleGates:
     layer: float = gate(
         0.15, "rad", "window around right and zero angles, for the mixture", "chosen on synthetic rooms"
     )
-    nearly: float = gate(
-        0.036,
-        "rad",
-        "that angles deviate which are nearly right",
-        "derived from the most and the layer: their geometric mean",
-    )
+    most: float = gate(8.7e-3, "rad", "that angles deviate which are meant to be right", "convention: half a degree")
     held: float = gate(1e-4, "rad", "by which right angles are held at least", "cost: conditioning of an adjustment")
     tried: int = gate(100, "deviations", "from the least to the most", "cost: each a twentieth larger than the last")
     known: float = gate(
@@ -205,11 +199,12 @@ def right_angles(
             offset=offset,
             variance=exact,
             unit=live,
-            clutter=0.5 * even + 0.5 * _normal(offset, exact + gates.nearly**2 * live),
+            # The nearly right deviate by the geometric mean of the layer and of the most that is right.
+            clutter=0.5 * even + 0.5 * _normal(offset, exact + gates.most * gates.layer * live),
             counted=telling,
             group=family,
         ),
-        np.full(6, PARALLEL.nearly),
+        np.full(6, gates.most),
         _worth(found[telling], family[telling], len(vectors)),
     )
     squared = (offset**2 / (exact + (told.deviation[family, None] * live) ** 2)).sum(axis=1)
@@ -303,7 +298,7 @@ def _normal(offset: FloatArray, variance: FloatArray) -> FloatArray:
 
 def _upper_end(squared: FloatArray, variance: FloatArray, pairs_per_vector: float, gates: AngleGates) -> float:
     """Upper end of the confidence interval of t; pairs of few vectors tell less than as many independent ones."""
-    tried = np.geomspace(gates.held, PARALLEL.nearly, gates.tried)
+    tried = np.geomspace(gates.held, gates.most, gates.tried)
     total = variance + tried[:, None] ** 2
     surprise = (np.log(total) + squared / total).sum(axis=1)
     return float(tried[np.flatnonzero(surprise <= surprise.min() + pairs_per_vector)[-1]])
