@@ -38,6 +38,9 @@ ORIGINS = ("derived from", "chosen on", "convention:", "cost:")
 LINE_MAPS, STRUCTURE = "chosen on benchmarks/lines.py", "chosen on benchmarks/structure.py"
 SURVEYED = "chosen on benchmarks/surveyed.py"
 STRECHA, KINECT = "chosen on Strecha's scenes", "chosen on Kinect images"
+SEQUENCES = "chosen on cabinet, redkitchen and KITTI 06"
+#: And a bound on cost that many have.
+SEARCH = "cost: time of a search"
 
 
 def gate(default: Any, unit: str, meaning: str, origin: str) -> Any:

@@ -53,14 +53,12 @@ class RollingShutterGates:
 
     turn: float = gate(np.radians(3.0), "rad", "deviation of a turn at the start", "convention: 100 degrees a second")
     shift: float = gate(0.3, "times", "distance to the nearest camera, of a shift at the start", "convention: a third")
-    smallest: float = gate(
-        1e-3, "times", "the standard deviation at the start, below which none falls", "cost: smaller ones hold as well"
-    )
+    smallest: float = gate(1e-3, "times", "the deviation at the start, at least", "cost: smaller ones hold as well")
     settled: float = gate(1.15, "times", "by which deviations change that have settled", "cost: 15 % of a weight")
     max_rounds: int = gate(4, "adjustments", "of a scene", "cost: most need three")
     max_images: int = gate(300, "images", "for which redundancy is computed; of more it is taken as one", "cost: time")
     parallel: float = gate(
-        np.radians(30.0), "rad", "between directions of readout that are parallel", "convention: half of what decides"
+        np.radians(30.0), "rad", "between parallel directions of readout", "convention: half of what decides"
     )
 
 

@@ -34,15 +34,9 @@ class StageGates:
         "chosen on matches of photographs, whose tails are still right",
     )  # fmt: skip
     tolerance: float = gate(1e-2, "share", "fall of the cost at which a stage that is not the last ends", "cost: steps")
-    restart_tolerance: float = gate(
-        0.3, "share", "the same for plain least squares before lines are restarted", "cost: steps of lines gone astray"
-    )
-    metric_start: float = gate(
-        1e-3, "share", "a tracked scene stays if a step promises less", "derived from where tracking ends"
-    )
-    given_up: float = gate(
-        0.05, "share", "of full weight; a relation with less was given up", "convention: of outliers of an M-estimator"
-    )
+    restart_tolerance: float = gate(0.3, "share", "the same of least squares, before restarts", "cost: steps")
+    metric_start: float = gate(1e-3, "share", "that a step promises, or a tracked scene stays", "derived from tracking")
+    given_up: float = gate(0.05, "share", "of full weight, below which it was given up", "convention: of M-estimators")
 
 
 #: The defaults.

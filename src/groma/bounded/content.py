@@ -24,9 +24,7 @@ class ReadingGates:
     pipe: int = gate(256 << 20, "bytes", "largest content of what is no regular file, such as a pipe", "cost: memory")
     line: int = gate(1 << 20, "characters", "longest line of a text file of numbers", "cost: memory and time")
     pixels: int = gate(1 << 24, "px", "largest image of any file", "cost: memory")
-    pixel_ratio: int = gate(
-        100, "px", "and so many for each byte of its file on top", "cost: memory; photographs hold 2 to 20 a byte"
-    )
+    pixel_ratio: int = gate(100, "px", "and so many for each byte of its file", "cost: memory; photographs: 2 to 20")
 
 
 #: The numbers in use.

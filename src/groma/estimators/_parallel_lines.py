@@ -35,7 +35,7 @@ import scipy  # its parts are imported when something of them is first used
 from groma._typing import FloatArray, IntArray
 from groma.estimators._direction_features import Parallel
 from groma.execution import map_in_threads
-from groma.gates import STRUCTURE, gate
+from groma.gates import SEARCH, STRUCTURE, gate
 from groma.geometry.algebra import perpendicular, unit
 
 #: Guesses processed by one task (cost: memory).
@@ -47,21 +47,15 @@ class ParallelGates:
     """How directions of lines are searched, beside the options."""
 
     freedom: float = gate(4.0, "1", "degrees of Student's distribution of what is parallel", STRUCTURE)
-    start_px: float = gate(
-        0.05, "px", "deviation of ends, before it is estimated", "chosen on benchmarks/structure.py, by likelihood"
-    )
+    start_px: float = gate(0.05, "px", "deviation of ends, before it is estimated", STRUCTURE + ", by likelihood")
     most_px: float = gate(3.0, "px", "deviation of ends at most", "chosen on benchmarks/structure.py")
     tried: int = gate(16, "deviations", "that are tried", "cost: each two fifths larger than the one before")
-    looser: float = gate(
-        4.0, "1", "how much less parallel than what is exactly so", "convention: walls to a fifth of a degree"
-    )
+    looser: float = gate(4.0, "1", "less parallel than what is exactly so", "convention: walls to a fifth of a degree")
     angles: int = gate(3, "deviations", "of directions that are tried", "cost: each twice as large as the one before")
     nearly: float = gate(8.7e-3, "rad", "that nearly parallel lines deviate", "convention: half a degree")
-    prior: float = gate(
-        0.5, "lines", "along a direction, and nearly along it, before any is seen", "derived from Jeffreys' prior"
-    )
-    max_candidates: int = gate(256, "directions", "candidates of one round", "cost: time of a search")
-    max_refined: int = gate(3, "directions", "best candidates that are refined", "cost: time of a search")
+    prior: float = gate(0.5, "lines", "along a direction or nearly, before any is seen", "derived from Jeffreys' prior")
+    max_candidates: int = gate(256, "directions", "candidates of one round", SEARCH)
+    max_refined: int = gate(3, "directions", "best candidates that are refined", SEARCH)
     rounds: int = gate(15, "rounds", "of expectation and maximisation", "cost: converges in fewer")
 
     @property

@@ -3,7 +3,7 @@
 
 from dataclasses import dataclass
 
-from groma.gates import gate
+from groma.gates import SEARCH, gate
 
 
 @dataclass(frozen=True)
@@ -39,40 +39,28 @@ class PlaneSearchGates:
     )  # fmt: skip
     neighbours: int = gate(32, "features", "neighbours that make a candidate, and that improve it", _SURVEYED)
     rank: int = gate(8, "features", "the neighbour whose distance is the spacing", _SURVEYED)
-    features_per_seed: int = gate(
-        4, "features", "features for each that is a seed, in large scenes", "cost: time of a search"
-    )
-    min_seeds: int = gate(1536, "seeds", "seeds in small scenes", "cost: time of a search")
-    repeated: int = gate(4, "seeds", "seeds at one feature", "cost: time of a search")
-    rounds: int = gate(3, "rounds", "rounds in which a candidate is improved", "cost: time of a search")
-    near_segments: int = gate(
-        24, "segments", "nearest segments that a segment is paired with", "cost: time of a search"
-    )
-    pairs: int = gate(2, "pairs", "pairs of a segment that become candidates", "cost: time of a search")
+    features_per_seed: int = gate(4, "features", "for each that is a seed, in large scenes", SEARCH)
+    min_seeds: int = gate(1536, "seeds", "seeds in small scenes", SEARCH)
+    repeated: int = gate(4, "seeds", "seeds at one feature", SEARCH)
+    rounds: int = gate(3, "rounds", "rounds in which a candidate is improved", SEARCH)
+    near_segments: int = gate(24, "segments", "nearest segments that a segment is paired with", SEARCH)
+    pairs: int = gate(2, "pairs", "pairs of a segment that become candidates", SEARCH)
     crossing: float = gate(0.26, "1", "sine of the angle of planes that cross", "convention: 15 degrees")
     not_collinear: float = gate(25.0, "variances", "spread of two segments across the longest axis", _SURVEYED)
-    max_followed: int = gate(8192, "features", "features that score a candidate", "cost: time of a search")
+    max_followed: int = gate(8192, "features", "features that score a candidate", SEARCH)
     link: float = gate(3.0, "spacings", "links between features on a plane", _SURVEYED)
-    wider: float = gate(
-        4.0, "1", "factor of the squared gate while a candidate is not yet exact: twice as far", _SURVEYED
-    )
-    far: float = gate(
-        50.0, "1", "factor of the squared gate beyond which features never join", "cost: time of a search"
-    )
+    wider: float = gate(4.0, "1", "factor of the squared gate while a candidate is inexact: twice as far", _SURVEYED)
+    far: float = gate(50.0, "1", "factor of the squared gate beyond which features never join", SEARCH)
     grow_steps: int = gate(10, "rounds", "rounds of refinement on growing support", "cost: ends when nothing moves")
     converged: float = gate(0.1, "sigma", "growth ends when no feature moves by more", "cost: a tenth of the noise")
     band: float = gate(8.0, "sigma", "half thickness of the layer in which a plane must stand out", _SURVEYED)
     polish_steps: int = gate(3, "rounds", "rounds with the probability of membership as the weight", _SURVEYED)
-    hopeless: float = gate(
-        0.5, "share", "of the least share; a plane below is given up early", "cost: time of a search"
-    )
-    fit_rounds: int = gate(
-        10, "rounds", "rounds of a fit with the variances of the last normal", "cost: converges in fewer"
-    )
+    hopeless: float = gate(0.5, "share", "of the least share; a plane below is given up early", SEARCH)
+    fit_rounds: int = gate(10, "rounds", "of a fit with the variances of the last normal", "cost: converges in fewer")
     extent: float = gate(0.9, "quantile", "of the distances from its middle: the radius of a plane", _SURVEYED)
     refined: float = gate(10.0, "planes", "planes that a refined candidate stands for", "derived from its rounds")
-    patience: int = gate(100, "candidates", "failures in a row that end the search", "cost: time of a search")
-    candidates_per_failure: int = gate(64, "candidates", "candidates for one more failure", "cost: time of a search")
+    patience: int = gate(100, "candidates", "failures in a row that end the search", SEARCH)
+    candidates_per_failure: int = gate(64, "candidates", "candidates for one more failure", SEARCH)
 
 
 #: The numbers in use.

@@ -31,7 +31,7 @@ from groma.errors import InputError, ShapeError
 from groma.estimators._direction_features import Perpendicular, crossings
 from groma.estimators._parallel_lines import PARALLEL, Acceptance, parallel_lines
 from groma.estimators.association import log10_poisson_tail
-from groma.gates import NORMAL, chi_square_gate, gate
+from groma.gates import NORMAL, SEARCH, chi_square_gate, gate
 from groma.geometry.algebra import dot, unit, vectors
 
 
@@ -40,8 +40,8 @@ class DirectionGates:
     """How common directions are searched, beside the options."""
 
     refine_steps: int = gate(12, "steps", "steps of the robust refinement", "cost: converges in fewer")
-    max_candidates: int = gate(512, "directions", "candidates of one round", "cost: time of a search")
-    max_scored: int = gate(4096, "features", "features that score them", "cost: time of a search")
+    max_candidates: int = gate(512, "directions", "candidates of one round", SEARCH)
+    max_scored: int = gate(4096, "features", "features that score them", SEARCH)
     min_sine: float = gate(0.02, "rad", "of two normals that make a candidate", "derived from noise of 0.05 degrees")
     wider: float = gate(4.0, "1", "factor of the squared gate in the refinement", "chosen on synthetic rooms")
     max_move: float = gate(0.05, "rad", "longest step of the refinement", "derived from linearity")

@@ -27,12 +27,8 @@ class ScoreGates:
         (1.0, 3.0, 5.0, 10.0), "deg", "thresholds of the area under the curve", "convention: image matching benchmarks"
     )
     time_difference: float = gate(0.01, "s", "times of poses that belong together", "convention: half of TUM's 0.02 s")
-    but_for_scale: float = gate(
-        0.25, "share", "of the error left by a free scale, to be told", "convention: 15/16 of squares"
-    )
-    unrelated_deg: float = gate(
-        60.0, "deg", "mean angle after alignment, to be warned of", "derived from random rotations: half"
-    )
+    but_for_scale: float = gate(0.25, "share", "of the error that a free scale leaves", "convention: 15/16 of squares")
+    unrelated_deg: float = gate(60.0, "deg", "mean angle that is warned of", "derived from random rotations: half")
     segment_lengths: tuple[float, ...] = gate(
         (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0), "m", "lengths of the segments of a drift", _KITTI
     )
@@ -43,9 +39,7 @@ class ScoreGates:
 class AlignmentGates:
     """When camera centres determine a rotation."""
 
-    known_rotation: float = gate(
-        math.radians(1.0), "rad", "noise of rotations known from centres", "convention: one degree"
-    )
+    known_rotation: float = gate(math.radians(1.0), "rad", "of rotations known from centres", "convention: one degree")
 
 
 #: The numbers in use.

@@ -49,12 +49,8 @@ class CloseEdgeGates:
         "deviation of a profile from the model, over its contrast",
         "chosen on rendered edges; with 0.005 to 0.04 places in halved photographs are up to a quarter worse",
     )
-    close: float = gate(
-        2.0, "px", "from a step to its pixels", "chosen on halved photographs of Strecha: 1.5 and 2.5 are worse"
-    )
-    displacement: float = gate(
-        0.35, "px", "by which neighbours still displace one step", "derived from edges one to three pixels apart"
-    )
+    close: float = gate(2.0, "px", "from a step to its pixels", "chosen on halved photographs: 1.5 and 2.5 are worse")
+    displacement: float = gate(0.35, "px", "by which neighbours displace a step", "derived from edges 1 to 3 px apart")
 
 
 #: The defaults.

@@ -39,7 +39,7 @@ from groma._numba import inline_kernel, kernel, loop
 from groma._ordering import median
 from groma._typing import FloatArray
 from groma.features.images import GrayImage, SmoothImage, smoothed
-from groma.gates import NORMAL, SIGMA_OF_MEDIAN, gate, numbers
+from groma.gates import NORMAL, SIGMA_OF_MEDIAN, STRECHA, gate, numbers
 
 #: Samples across the segment reach this far on either side, pixels: the size of an array.
 REACH = 3
@@ -54,9 +54,7 @@ class EdgeGates:
 
     window: float = gate(1.5, "px", "standard deviation of the window around a peak", "chosen on rendered edges")
     max_shift: float = gate(1.5, "px", "ends that would move further keep their place", "chosen on rendered edges")
-    min_sigma: float = gate(
-        0.03, "px", "what no image can tell: lens model, shading", "chosen on Strecha's scenes, against their surveys"
-    )
+    min_sigma: float = gate(0.03, "px", "what no image can tell: lens model, shading", STRECHA + ": their surveys")
     unfitted_sigma: float = gate(0.5, "px", "segments that could not be fitted", "derived from the detector's pixels")
     prior_sigma: float = gate(0.15, "px", "noise of one sample, before any is seen", "chosen on Strecha's scenes")
     prior_count: float = gate(10.0, "samples", "samples that this weighs", "chosen on Strecha's scenes")

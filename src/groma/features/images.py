@@ -27,9 +27,7 @@ class ImageGates:
     """What grey levels are taken to be."""
 
     noise: float = gate(2.0, "grey levels", "noise of a pixel", "convention: a photograph of 8 bits in good light")
-    blur: float = gate(
-        0.8, "px", "of images that are measured", "derived from cubic interpolation: exact to 0.01 pixels then"
-    )
+    blur: float = gate(0.8, "px", "of images that are measured", "derived from cubic interpolation: exact to 0.01 px")
 
 
 #: The numbers in use.

@@ -54,12 +54,8 @@ class NetworkGates:
         (2.5, 5.0), "px", "to either side of a segment, where an edge is looked for too",
         "derived from cells of two pixels, and tiles reduced by up to 1.25",
     )  # fmt: skip
-    same: float = gate(
-        1.5, "px", "distance of the ends of a segment from a longer one on it", "derived from edges a pixel wide"
-    )
-    largest: int = gate(
-        1 << 22, "pixels", "of the network's input", "cost: 100 bytes of memory for each; those of M-LSD have 1 << 18"
-    )
+    same: float = gate(1.5, "px", "of the ends of a segment from a longer one on it", "derived from edges a pixel wide")
+    largest: int = gate(1 << 22, "pixels", "of the network's input", "cost: 100 bytes for each; M-LSD has 1 << 18")
     covered: float = gate(0.8, "share", "of a segment that a longer one covers, for it to go", "convention: most of it")
 
 

@@ -50,13 +50,9 @@ class PatchGates:
     spread: float = gate(4.0, "px", "standard deviation of the window", "chosen on Strecha's scenes")
     max_iterations: int = gate(20, "steps", "steps of an alignment", "cost: converges in fewer")
     step: float = gate(2e-3, "px", "a smaller step ends the alignment", "cost: a tenth of what it is good for")
-    shape_sigma: float = gate(
-        0.1, "1", "how far a step may turn, shear and stretch the patch, against grey levels of no texture", STRECHA
-    )
+    shape_sigma: float = gate(0.1, "1", "how far a step may turn, shear and stretch a patch without texture", STRECHA)
     unexplained: float = gate(0.01, "share", "of the contrast squared, that no template explains", STRECHA)
-    min_texture: float = gate(
-        1.0, "grey levels squared", "templates with less are left alone", "derived from camera noise"
-    )
+    min_texture: float = gate(1.0, "grey levels squared", "with less a template is left", "derived from camera noise")
 
 
 #: The defaults.

@@ -19,7 +19,7 @@ import numpy as np
 from groma._numba import loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.features.images import GrayImage
-from groma.gates import SIGMA_OF_MEDIAN, gate
+from groma.gates import SEQUENCES, SIGMA_OF_MEDIAN, gate
 
 _HALF = np.float32(0.5)
 
@@ -28,20 +28,14 @@ _HALF = np.float32(0.5)
 class PointTrackGates:
     """Points worth following, and points that were followed."""
 
-    min_alike: float = gate(
-        0.5, "correlation", "of a patch with the one it was followed from", "derived from signal over noise"
-    )
+    min_alike: float = gate(0.5, "correlation", "of a patch with the one before", "derived from signal over noise")
     iterations: int = gate(15, "steps", "steps of Lucas-Kanade on each level", "cost: converges in fewer")
     converged: float = gate(0.03, "px", "a smaller step ends them", "cost: a tenth of what they are good for")
     min_texture: float = gate(1e-4, "1", "least eigenvalue of a patch, OpenCV's units", "convention: OpenCV's default")
     block: int = gate(5, "px", "width of the blocks in which corners are rated", "chosen on rendered rooms")
-    above_noise: float = gate(
-        4.0, "ratio", "eigenvalue of a corner to that of noise", "derived from noise: three corners in 640 x 480 at 4"
-    )
+    above_noise: float = gate(4.0, "ratio", "eigenvalue of a corner to noise", "derived from noise: three in 640 x 480")
     quality: float = gate(0.005, "share", "eigenvalue of a corner, of the strongest", "chosen on rendered rooms")
-    max_shift: float = gate(
-        2.5, "px", "of a point from where it was expected", "chosen on cabinet, redkitchen and KITTI 06"
-    )
+    max_shift: float = gate(2.5, "px", "of a point from where it was expected", SEQUENCES)
 
     @property
     def noise_eigenvalue(self) -> float:

@@ -35,9 +35,7 @@ from groma.scene import Scene
 class MirrorGates:
     """Which matches tell a photograph from its mirror image."""
 
-    closest: float = gate(
-        0.25, "share", "of the matches of both, the most alike, that are counted", "chosen on the filing cabinet"
-    )
+    closest: float = gate(0.25, "share", "of the matches of both that count", "chosen on the filing cabinet")
 
 
 GATES = MirrorGates()

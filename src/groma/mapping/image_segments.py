@@ -38,12 +38,8 @@ from groma.scene import Scene
 class LensGates:
     """When images are resampled without the distortion of their lens, and how large they may become."""
 
-    negligible: float = gate(
-        0.05, "px", "movement of pixels by a lens that is taken as it is", "derived from the noise of segments: a third"
-    )
-    max_growth: float = gate(
-        2.0, "1", "side of the resampled image over that of the original", "cost: wide lenses lose their corners"
-    )
+    negligible: float = gate(0.05, "px", "of pixels by a lens that is ignored", "derived from noise: a third")
+    max_growth: float = gate(2.0, "1", "of the resampled image over the original", "cost: wide lenses lose corners")
 
 
 GATES = LensGates()

@@ -79,9 +79,7 @@ from groma.solver.linear.blas import one_blas_thread
 class MappingGates:
     """How noise becomes weight, and when lines are mapped again."""
 
-    loss_scale: float = gate(
-        6.0, "sigma", "scale of the first loss: matches have a narrow core and heavy tails", SURVEYED
-    )
+    loss_scale: float = gate(6.0, "sigma", "of the first loss: matches have a narrow core and heavy tails", SURVEYED)
     last_loss_scale: float = gate(
         4.0, "sigma", "scale of the Cauchy loss of the last adjustment, relative to the noise of each point",
         "derived from Student's distribution that fits these residuals best, which bends at 4 to 5",

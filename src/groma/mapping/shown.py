@@ -29,12 +29,7 @@ from groma.scene import Scene
 class ShownGates:
     """How photographs are compared with the points of a model."""
 
-    pairs: int = gate(
-        5,
-        "pairs",
-        "that are compared: the images that see most points, each with another",
-        "cost: a sixth of a second each",
-    )
+    pairs: int = gate(5, "pairs", "of the images that see most points, each with another", "cost: 0.2 s each")
     points: int = gate(200, "points", "of a pair at most", "cost: of describing them")
     least: int = gate(20, "points", "of a pair at least", "derived from ranks: the share is good to a tenth")
     roll: float = gate(0.5, "rad", "between the photographs of a pair", "convention: places are described upright")

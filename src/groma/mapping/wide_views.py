@@ -30,12 +30,8 @@ from groma.geometry.algebra import unit
 class WideGates:
     """Which images are seen in several views, and how far views reach."""
 
-    max_lost: float = gate(
-        0.05, "share", "of an image that a plane of twice its size lacks", "convention: one in twenty"
-    )
-    overlap: float = gate(
-        5.0, "deg", "by which a view reaches beyond its side of the cube", "cost: edges at a border are measured whole"
-    )
+    max_lost: float = gate(0.05, "share", "of an image that a plane twice its size lacks", "convention: one in twenty")
+    overlap: float = gate(5.0, "deg", "of a view beyond its side of the cube", "cost: edges at a border are whole")
     max_fold: float = gate(0.5, "px", "of a pixel whose ray is projected again", "convention: half a pixel")
     border: float = gate(2.0, "px", "at the end of what a camera sees, where nothing is found", "derived from the blur")
     min_share: float = gate(0.01, "share", "of an image that a view shows", "cost: a view for less finds nothing")

@@ -46,9 +46,7 @@ _BATCH, _AT_ONCE = 300_000, 16
 class JackknifeGates:
     """What is believed of single landmarks."""
 
-    max_leverage: float = gate(
-        0.9, "share", "of an error that cameras follow", "derived from errors ten times as large"
-    )
+    max_leverage: float = gate(0.9, "share", "of an error that cameras follow", "derived from errors ten times larger")
 
 
 GATES = JackknifeGates()

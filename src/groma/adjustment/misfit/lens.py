@@ -47,12 +47,8 @@ WIDER: dict[str, str] = dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADI
 class LensGates:
     """When residuals show a lens."""
 
-    false_alarm: float = gate(
-        1e-6, "probability", "of rings of residuals that are noise alone", "convention: five sigma"
-    )
-    share: float = gate(
-        0.1, "share", "of the residuals' variance, above which a warning says so", "convention: a tenth"
-    )
+    false_alarm: float = gate(1e-6, "probability", "of rings of residuals that are noise", "convention: five sigma")
+    share: float = gate(0.1, "share", "of the residuals' variance that calls for a warning", "convention: a tenth")
     rings: int = gate(16, "rings", "of equal area around the principal point", "convention: as many as a histogram has")
     max_observations: int = gate(200_000, "observations", "that judge a lens or a rig", "cost: more tell no more")
     max_iterations: int = gate(4, "steps", "with free distortion", "cost: the first brings most")

@@ -49,9 +49,7 @@ _KINDS = {"point": Kind.POINT, "line": Kind.LINE, "plane": Kind.PLANE, "directio
 class ObjectGates:
     """Messages about measured objects."""
 
-    parallel_deg: float = gate(
-        10.0, "degrees", "from parallel, from which two lines have a shortest distance and no width", "cost: a meaning"
-    )
+    parallel_deg: float = gate(10.0, "degrees", "from parallel, where lines have no width", "cost: a meaning")
 
 
 GATES = ObjectGates()

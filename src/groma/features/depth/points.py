@@ -10,19 +10,17 @@ import numpy.typing as npt
 
 from groma._numba import loop
 from groma._typing import FloatArray
-from groma.gates import gate
-
-_SEQUENCES = "chosen on cabinet, redkitchen and KITTI 06"
+from groma.gates import SEQUENCES, gate
 
 
 @dataclass(frozen=True)
 class DepthPointGates:
     """Where a depth can be read."""
 
-    min_known: int = gate(4, "pixels", "known depths among a pixel and its eight neighbours", _SEQUENCES)
-    jump: float = gate(0.01, "scene units", "depths around a pixel differ by less, plus a share", _SEQUENCES)
-    jump_share: float = gate(0.04, "share", "share of the depth by which they may differ", _SEQUENCES)
-    correlation: float = gate(6.0, "samples", "pixels that err alike count as one", _SEQUENCES)
+    min_known: int = gate(4, "pixels", "known depths among a pixel and its eight neighbours", SEQUENCES)
+    jump: float = gate(0.01, "scene units", "depths around a pixel differ by less, plus a share", SEQUENCES)
+    jump_share: float = gate(0.04, "share", "share of the depth by which they may differ", SEQUENCES)
+    correlation: float = gate(6.0, "samples", "pixels that err alike count as one", SEQUENCES)
 
 
 #: The defaults.

@@ -45,9 +45,7 @@ from groma.solver.covariance.marginals import Covariances
 class CommonErrorGates:
     """Of which maps common errors are told."""
 
-    unknowns: int = gate(
-        4000, "unknowns", "of poses and calibrations at most; larger maps are treated as exact", "cost: their square"
-    )
+    unknowns: int = gate(4000, "unknowns", "of poses and calibrations; larger maps are exact", "cost: their square")
 
 
 GATES = CommonErrorGates()

@@ -36,9 +36,7 @@ from groma.localization.pose.refinement import refine
 class MapErrorGates:
     """Which images of a map are compared with the rest of it."""
 
-    images: int = gate(
-        32, "images", "compared at most, evenly chosen", "cost: of a pose each; a deviation good to a tenth"
-    )
+    images: int = gate(32, "images", "compared at most, evenly chosen", "cost: of a pose each; it is good to a tenth")
     least: int = gate(3, "images", "that say something about the map", "derived from the median: it stands one wrong")
     matches: int = gate(10, "matches", "that such a pose is estimated from at least", "derived from 6 unknowns")
 

@@ -44,9 +44,7 @@ class MergeGates:
     photographs: int = gate(24, "images", "of the second map that are looked for in the first", "cost: linear in it")
     same_place: float = gate(0.5, "px", "distance of the same feature, found twice", "convention: half a pixel")
     growth: float = gate(2.0, "1", "of the noise, until half of the matches agree", "convention: doubling")
-    doublings: int = gate(
-        6, "steps", "of the noise: that of landmarks is without errors of poses", "cost: of estimates"
-    )
+    doublings: int = gate(6, "steps", "of the noise: that of landmarks lacks errors of poses", "cost: of estimates")
 
 
 GATES = MergeGates()

@@ -23,12 +23,8 @@ class UnitGates:
     """When points tell the unit of depth maps."""
 
     min_points: int = gate(10, "points", "with a depth, that tell a unit", "convention: ten")
-    max_scatter: float = gate(
-        0.25, "log", "scatter of the ratios of depths of a map whose unit is estimated", "convention: a quarter"
-    )
-    different: float = gate(
-        0.1, "log", "scatter of the units of the maps, from which on they are no common one", "convention: a tenth"
-    )
+    max_scatter: float = gate(0.25, "log", "scatter of ratios of depths in a map with a unit", "convention: a quarter")
+    different: float = gate(0.1, "log", "scatter of the units of maps without a common one", "convention: a tenth")
     known: float = gate(0.2, "log", "by which a unit may differ from that of other measurements", "convention: a fifth")
 
 

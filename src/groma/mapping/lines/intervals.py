@@ -35,9 +35,7 @@ class SupportGates:
     """Beside which parts of a line its edge lies, in addition to when segments agree."""
 
     parts: int = gate(24, "parts", "of a line, judged each on its own", "cost: memory; most ends are known no better")
-    min_leaving: int = gate(
-        2, "segments", "that leave a line where its edge lies beside it", "convention: one alone may be of another edge"
-    )
+    min_leaving: int = gate(2, "segments", "that leave a line beside its edge", "convention: one may be another edge")
 
 
 GATES = SupportGates()

@@ -32,9 +32,7 @@ class ViewGates:
     num_near: int = gate(6, "points", "at ends and middle of a segment that tell its depth", LINE_MAPS)
     depth_quantile: float = gate(0.01, "quantile", "of inverse depths in an image, at either end", LINE_MAPS)
     num_baselines: int = gate(5, "images", "nearest cameras that tell the scale without points", LINE_MAPS)
-    inverse_depth_range: tuple[float, float] = gate(
-        (1e-3, 2.0), "1/baseline", "searched where no points are", LINE_MAPS
-    )
+    inverse_depth_range: tuple[float, float] = gate((1e-3, 2.0), "1/baseline", "searched without points", LINE_MAPS)
 
 
 GATES = ViewGates()

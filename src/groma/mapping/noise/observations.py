@@ -45,9 +45,7 @@ class ObservationNoiseGates:
 
     unknown_px: float = gate(1.0, "px", "noise where nothing tells it", "convention: a pixel")
     max_fitted: float = gate(0.8, "share", "of the residuals that landmarks take", "derived from five tracks of two")
-    min_views: int = gate(
-        4, "observations", "of a landmark that tells its noise from chance", "derived from one degree of freedom in two"
-    )
+    min_views: int = gate(4, "observations", "of a landmark that tells its noise", "derived from one freedom in two")
     max_correlation: float = gate(0.8, "1", "of the two ends of segments", "chosen on benchmarks/surveyed.py")
 
 

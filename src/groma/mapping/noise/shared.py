@@ -36,12 +36,10 @@ class SharedNoiseGates:
 
     num_cells: int = gate(64, "cells", "along the longer side of an image", "cost: how finely distances are told apart")
     rings: tuple[float, ...] = gate(
-        (1.0, 2.0, 4.0, 8.0, 16.0), "cells", "distances at which rings of pairs end", "convention: doubling"
+        (1.0, 2.0, 4.0, 8.0, 16.0), "cells", "at which rings of pairs end", "convention: doubling"
     )
     min_observations: int = gate(1000, "observations", "that tell what they share", SURVEYED)
-    min_share: float = gate(
-        0.25, "share", "of the variance of errors that residuals have at least", "derived from points of two views"
-    )
+    min_share: float = gate(0.25, "share", "of errors' variance that residuals have", "derived from two views")
 
 
 GATES = SharedNoiseGates()

@@ -47,9 +47,7 @@ class AveragingGates:
 
     steps: int = gate(15, "steps", "under each of the two losses", "cost: converged before")
     noise_steps: int = gate(3, "steps", "after which the noise is estimated again", "cost: it needs an inverse")
-    odd: float = gate(
-        3.0, "ratio", "to the median disagreement with neighbours, to start elsewhere", "convention: three"
-    )
+    odd: float = gate(3.0, "ratio", "to the median disagreement, to start elsewhere", "convention: three")
     nearest: float = gate(0.5, "share", "of the distance of two images with a parallax", "convention: a half")
 
 

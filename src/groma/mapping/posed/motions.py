@@ -30,9 +30,7 @@ class MotionGates:
 
     noise_px: float = gate(1.0, "px", "least noise of a match: SIFT's, and calibrations'", "convention: COLMAP")
     steps: int = gate(5, "steps", "of refinement; two suffice near a solution", "cost: the joint adjustment follows")
-    floor: float = gate(
-        np.radians(0.1), "rad", "least error of a motion, which matches share", "chosen on fountain-P11"
-    )
+    floor: float = gate(np.radians(0.1), "rad", "least error of a motion, common to matches", "chosen on fountain-P11")
     weakest: float = gate(np.radians(20.0), "rad", "of a motion that tells nothing", "convention: a third of a radian")
 
 

@@ -59,15 +59,11 @@ Vector = tuple[FloatArray, FloatArray]
 class AngleGates:
     """Which angles are right."""
 
-    layer: float = gate(
-        0.15, "rad", "window around right and zero angles, for the mixture", "chosen on synthetic rooms"
-    )
+    layer: float = gate(0.15, "rad", "window around right and zero angles of the mixture", "chosen on synthetic rooms")
     most: float = gate(8.7e-3, "rad", "that angles deviate which are meant to be right", "convention: half a degree")
     held: float = gate(1e-4, "rad", "by which right angles are held at least", "cost: conditioning of an adjustment")
     tried: int = gate(100, "deviations", "from the least to the most", "cost: each a twentieth larger than the last")
-    known: float = gate(
-        0.01, "rad", "standard deviation of an angle, above which it says nothing", "chosen on synthetic rooms"
-    )
+    known: float = gate(0.01, "rad", "deviation of an angle that still says something", "chosen on synthetic rooms")
 
 
 GATES = AngleGates()

@@ -41,9 +41,7 @@ class BendingGates:
         "that quarters of a plane are turned against it, root mean square",
         "convention: two degrees; round bodies have none at one, a few at three, flat and rough walls all of theirs",
     )
-    members: int = gate(
-        6, "members", "of a quarter at least, points and segment ends", "derived from two for an unknown"
-    )
+    members: int = gate(6, "members", "of a quarter at least, points and segment ends", "derived from two an unknown")
 
 
 def bending(

@@ -15,7 +15,7 @@ import numpy as np
 from groma._trees import kd_tree, nearest
 from groma._typing import FloatArray, IntArray
 from groma.estimators.membership import Candidates, memberships
-from groma.gates import STRUCTURE, chi_square_gate, gate
+from groma.gates import SEARCH, STRUCTURE, chi_square_gate, gate
 from groma.geometry.algebra import dot, norm, unit
 from groma.mapping.groups import distinct_pairs
 from groma.mapping.structure.relations import Landmarks, Pairs
@@ -29,7 +29,7 @@ class JunctionGates:
     end_px: float = gate(2.5, "px", "deviation of the end of a line from where it meets another", STRUCTURE)
     most_px: float = gate(1.0, "px", "that lines that meet may miss each other", "chosen on benchmarks/structure.py")
     min_sine: float = gate(0.17, "1", "of the angle of two lines that meet", "convention: ten degrees")
-    nearest: int = gate(24, "samples", "of lines that an end of a line is compared with", "cost: time of a search")
+    nearest: int = gate(24, "samples", "of lines that an end of a line is compared with", SEARCH)
     max_samples: int = gate(256, "samples", "of a line", "cost: memory")
 
 

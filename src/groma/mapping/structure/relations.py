@@ -19,7 +19,7 @@ from groma.estimators.association import inlier_probability
 from groma.estimators.membership import MEMBERSHIPS, Candidates, memberships
 from groma.estimators.plane_search import BAND, PlaneSet, connected_to
 from groma.execution import map_in_threads, together
-from groma.gates import chi_square_gate, gate
+from groma.gates import SEARCH, SURVEYED, chi_square_gate, gate
 from groma.geometry.algebra import dot, norm
 from groma.mapping.groups import distinct_pairs
 from groma.mapping.noise.landmarks import LineNoise, PointNoise
@@ -30,28 +30,13 @@ from groma.scene import LineIntervals
 class RelationGates:
     """What competes for a landmark, and where landmarks are looked for."""
 
-    competing: float = gate(
-        0.26, "rad", "between the normals of planes that compete for a landmark", "chosen on benchmarks/surveyed.py"
-    )
-    line_margin: float = gate(
-        0.02, "1", "of the length of a line, that points on it may be beyond", "chosen on benchmarks/surveyed.py"
-    )
-    neighbor: int = gate(
-        8, "neighbours", "at whose distance a landmark has its surroundings", "chosen on benchmarks/surveyed.py"
-    )
-    layer: float = gate(
-        3.0,
-        "bands",
-        "window around a plane for the mixture of members and clutter",
-        "derived from deviations up to the band",
-    )
-    widest: float = gate(
-        0.33, "layers", "that members of a plane may deviate", "derived from normal noise: the layer holds 3 deviations"
-    )
-    num_nearest: int = gate(12, "samples", "of segments that a point is compared with", "cost: time of a search")
-    num_samples: tuple[int, int] = gate(
-        (50_000, 12), "samples", "of all segments, and per segment on average", "cost: memory"
-    )
+    competing: float = gate(0.26, "rad", "between planes that compete for a landmark", SURVEYED)
+    line_margin: float = gate(0.02, "1", "of the length of a line, that points on it may be beyond", SURVEYED)
+    neighbor: int = gate(8, "neighbours", "at whose distance a landmark has its surroundings", SURVEYED)
+    layer: float = gate(3.0, "bands", "window around a plane, for the mixture", "derived from deviations to the band")
+    widest: float = gate(0.33, "layers", "that members of a plane may deviate", "derived from normal noise: a third")
+    num_nearest: int = gate(12, "samples", "of segments that a point is compared with", SEARCH)
+    num_samples: tuple[int, int] = gate((50_000, 12), "samples", "of all segments, and of each", "cost: memory")
 
 
 GATES = RelationGates()

@@ -5,18 +5,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from groma.gates import gate
-
-SEQUENCES = "chosen on cabinet, redkitchen and KITTI 06"
+from groma.gates import SEQUENCES, gate
 
 
 @dataclass(frozen=True)
 class CheckGates:
     """Frames that are of no use."""
 
-    sparse_depth: float = gate(
-        0.2, "share", "depth images with fewer known depths are reported", "convention: a sentence for the reader only"
-    )
+    sparse_depth: float = gate(0.2, "share", "known depths; fewer are reported", "convention: a sentence only")
 
 
 @dataclass(frozen=True)
@@ -26,15 +22,8 @@ class TurnGates:
     width: int = gate(64, "px", "width of the small images", SEQUENCES + " and rendered turns")
     steps: int = gate(12, "steps", "Gauss-Newton steps of an alignment", "cost: converges in fewer")
     min_overlap: float = gate(0.25, "share", "smallest overlap of two aligned images", SEQUENCES)
-    outlier: float = gate(
-        3.0,
-        "medians",
-        "scale of the robust weight of a difference of grey levels",
-        "derived from normal noise: 2 sigma",
-    )
-    converged: float = gate(
-        0.02, "px", "an alignment ends when steps are smaller", "cost: a tenth of what it is good for"
-    )
+    outlier: float = gate(3.0, "medians", "of a robust weight of grey levels", "derived from normal noise: 2 sigma")
+    converged: float = gate(0.02, "px", "a smaller step ends an alignment", "cost: a tenth of what it is good for")
     agrees: float = gate(0.8, "correlation", "a prediction that agrees so well needs no help", SEQUENCES)
     gain: float = gate(0.04, "correlation", "by how much a turn must agree better than a prediction", SEQUENCES)
     min_places: int = gate(8, "places", "places that a judgement needs", SEQUENCES)
@@ -45,25 +34,14 @@ class TurnGates:
 class DepthGates:
     """Depth images: noise, and where the depth beside a segment is read."""
 
-    inverse_sigma: float = gate(
-        0.003, "1 / scene unit", "of inverse depth: 3 mm at 1 m", "derived from Kinect disparities"
-    )
+    inverse_sigma: float = gate(0.003, "1 / unit", "of inverse depth: 3 mm at 1 m", "derived from Kinect disparities")
     min_sigma: float = gate(0.003, "scene units", "a depth is not known better", "derived from millimetres in files")
     near: float = gate(0.5, "px", "depth beside a segment is read from this distance on", SEQUENCES)
     far: float = gate(4.5, "px", "and up to this distance, so that narrow faces are not missed", SEQUENCES)
-    min_images: int = gate(
-        8, "images", "that tell an offset of inverse depths", "derived from the samples of a variance good to a half"
-    )
-    max_misfit: float = gate(
-        2.0,
-        "ratio",
-        "noise of depths to that stated, above which they are said not to fit",
-        "convention: a sentence only",
-    )
+    min_images: int = gate(8, "images", "that tell an offset of depths", "derived from a variance good to a half")
+    max_misfit: float = gate(2.0, "ratio", "noise of depths to that stated that is told", "convention: a sentence only")
     grid: int = gate(20, "px", "distance of the places whose depth is kept, and on planes", "cost: 768 in 640 x 480")
-    far_share: float = gate(
-        0.25, "share", "largest noise of a stereo depth; far points serve as well as near ones", SEQUENCES
-    )
+    far_share: float = gate(0.25, "share", "largest noise of a stereo depth; far points serve, too", SEQUENCES)
 
 
 @dataclass(frozen=True)
@@ -107,35 +85,23 @@ class StereoGates:
 class RectificationGates:
     """How the right camera of a pair is turned."""
 
-    sigma_deg: float = gate(
-        0.1, "degree", "standard deviation of each angle before anything is known", "derived from rectified sequences"
-    )
-    band_deg: float = gate(
-        0.5, "degree", "the first pairs are searched this far from their rows", "derived from 5 standard deviations"
-    )
-    keystone_deg: float = gate(
-        2.0, "degree", "keystones and angles of rows stay well below", "derived from 20 standard deviations"
-    )
+    sigma_deg: float = gate(0.1, "degree", "of each angle before anything is known", "derived from rectified sequences")
+    band_deg: float = gate(0.5, "degree", "from their rows, where first pairs are searched", "derived from 5 sigma")
+    keystone_deg: float = gate(2.0, "degree", "bound of keystones and rows", "derived from 20 sigma")
     num_features: int = gate(1500, "features", "described in each image of the first pairs", "cost: 0.1 seconds")
     max_disparity: float = gate(0.2, "share", "largest disparity, of the width of the image", "cost: search is wide")
     looks: int = gate(10, "pairs", "pairs that are asked until one shows enough", "cost: 0.1 seconds each")
     iterations: int = gate(15, "steps", "reweighted fits of rows", "cost: converges in fewer")
     cells: int = gate(8, "cells", "cells along the width, within which errors are alike", "chosen on KITTI 06")
-    min_cells: int = gate(
-        6, "cells", "cells that show points; three numbers are fitted", "derived from twice the numbers"
-    )
+    min_cells: int = gate(6, "cells", "that show points; three numbers are fitted", "derived from twice the numbers")
     min_pairs: int = gate(30, "points", "points found in both images", "derived from five a cell")
-    min_keyframes: int = gate(
-        2, "keyframes", "keyframes at which angles are first estimated", "cost: rows alone before"
-    )
+    min_keyframes: int = gate(2, "keyframes", "at which angles are first estimated", "cost: rows alone before")
     max_step: float = gate(0.22, "share", "of the depth between keyframes: patches slide", "chosen on KITTI 06")
     min_columns: int = gate(100, "points", "columns that tell yaw", "derived from thirty in each of two pairs, twice")
     min_views: int = gate(4, "keyframes", "that see a point whose columns count", "chosen on KITTI 06")
     max_iterations: int = gate(50, "steps", "steps of the adjustment that tells yaw", "cost: converges in fewer")
     growth: float = gate(1.5, "ratio", "of keyframes, at which angles are estimated anew", "cost: adds up")
-    as_sure: float = gate(
-        1.5, "ratio", "of variances of yaw that count as equal", "derived from 15 cells: they differ by a half"
-    )
+    as_sure: float = gate(1.5, "ratio", "of variances of yaw that count as equal", "derived from 15 cells")
     start_over: float = gate(0.3, "px", "error in the right image; first landmarks are not kept", "chosen on KITTI 06")
     matters: float = gate(0.05, "px", "a smaller change in the right image is not worth adjusting anew", "cost: time")
 

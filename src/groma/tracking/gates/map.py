@@ -6,8 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from groma.gates import gate
-from groma.tracking.gates.frame import SEQUENCES
+from groma.gates import SEQUENCES, gate
 
 
 @dataclass(frozen=True)
@@ -16,15 +15,9 @@ class KeyframeGates:
 
     max_frames: int = gate(30, "frames", "frames between keyframes while the camera moves", SEQUENCES)
     moved: float = gate(0.25, "share", "share of the motion of a keyframe that counts as moving", SEQUENCES)
-    nearby: float = gate(
-        0.5, "share", "share of the motion of a keyframe within which an older one stands for it", SEQUENCES
-    )
-    delay: int = gate(
-        2, "frames", "after which what threads worked out is taken up: a keyframe, a window", "cost: waiting for it"
-    )
-    delay_seconds: float = gate(
-        0.045, "s", "of the camera's clock before a keyframe is made, for its features", "cost: waiting for them"
-    )
+    nearby: float = gate(0.5, "share", "of the motion of a keyframe within which an older one stands for it", SEQUENCES)
+    delay: int = gate(2, "frames", "after which what threads worked out is taken up", "cost: waiting for it")
+    delay_seconds: float = gate(0.045, "s", "of the camera, before a keyframe is made", "cost: waiting for them")
 
 
 @dataclass(frozen=True)
@@ -34,12 +27,8 @@ class PointGates:
     same_feature: float = gate(2.0, "px", "a feature within this distance of a followed point is that point", SEQUENCES)
     few: float = gate(0.33, "share", "with fewer of the wanted points, one camera places features by motion", SEQUENCES)
     corner_distance: float = gate(0.7, "cells", "distance of new corners", SEQUENCES)
-    border: float = gate(
-        8.0, "px", "distance of new points from the edge of the image", "derived from the patch: 15 px"
-    )
-    patch_keyframes: int = gate(
-        2, "keyframes", "keyframes whose patches are looked for in one frame", "cost: time per frame"
-    )
+    border: float = gate(8.0, "px", "of new points from the edge of the image", "derived from the patch: 15 px")
+    patch_keyframes: int = gate(2, "keyframes", "whose patches are looked for in one frame", "cost: time per frame")
     again_radius: float = gate(6.0, "px", "distance at which a point of the map is found again", SEQUENCES)
     again_room: float = gate(0.2, "share", "share of the wanted points that must be missing", "cost: time per frame")
     min_parallax: float = gate(0.015, "rad", "angle between rays that place a point", SEQUENCES)
@@ -54,9 +43,7 @@ class LineGates:
     reduction: int = gate(2, "1", "factor by which images are reduced for the flow", "cost: time per frame")
     voters: int = gate(12, "points", "points that vote for where a segment went", SEQUENCES)
     vote_distances: tuple[float, ...] = gate((8.0, 4.0, 3.0), "px", "voters agree within, round by round", SEQUENCES)
-    max_sigma: float = gate(
-        0.45, "px", "segments with less certain edges are not found", "derived from 0.5 px if unfitted"
-    )
+    max_sigma: float = gate(0.45, "px", "of the edge of a segment that is found", "derived from 0.5 px if unfitted")
     weaker: float = gate(0.35, "ratio", "an edge may be weaker than it was by this factor", SEQUENCES)
     stronger: float = gate(3.0, "ratio", "and stronger", SEQUENCES)
     min_strength: float = gate(2.0, "grey levels / px", "weakest edge", SEQUENCES)
@@ -72,18 +59,14 @@ class LineGates:
     min_sine: float = gate(0.03, "rad", "angle of the planes that place a line by motion", SEQUENCES)
     max_depth_ratio: float = gate(3.0, "ratio", "depths of the ends of a line placed by motion", SEQUENCES)
     max_extension: float = gate(2.0, "ratio", "a line grows by at most this factor in one keyframe", SEQUENCES)
-    few_points: int = gate(
-        120, "points", "with fewer points the depth along segments is measured too", "cost: time per frame"
-    )
+    few_points: int = gate(120, "points", "with fewer the depth along segments is measured too", "cost: time per frame")
 
 
 @dataclass(frozen=True)
 class PlaneGates:
     """Planes: assigned, grown, merged."""
 
-    angle: float = gate(
-        math.radians(8.0), "rad", "a plane of a keyframe is one of the map within this angle", SEQUENCES
-    )
+    angle: float = gate(math.radians(8.0), "rad", "a plane of a keyframe is one of the map within", SEQUENCES)
     distance: float = gate(0.08, "scene units", "and distance of the seen part", SEQUENCES)
     wider: float = gate(1.5, "times", "both, between frames; within them none is new", SEQUENCES)
     merge_angle: float = gate(0.06, "rad", "planes of the map are one within this angle", SEQUENCES)
@@ -101,9 +84,7 @@ class LandmarkPlaneGates:
     surface_sigmas_px: tuple[float, ...] = gate(
         (0.2, 0.8, 3.2), "px", "deviations of surfaces that are tried", "derived from photographs, x 1, 4, 16"
     )
-    min_views: int = gate(
-        2, "images", "that see a landmark (a stereo pair is two); it was followed between them", SEQUENCES
-    )
+    min_views: int = gate(2, "images", "that see a landmark (a pair is two); it was followed between them", SEQUENCES)
 
 
 @dataclass(frozen=True)

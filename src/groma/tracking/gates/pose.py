@@ -5,8 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from groma.gates import gate
-from groma.tracking.gates.frame import SEQUENCES
+from groma.gates import SEQUENCES, gate
 
 
 @dataclass(frozen=True)
@@ -28,24 +27,14 @@ class StartGates:
     """The first frames of a map."""
 
     min_known: int = gate(15, "points", "points with depth (a line counts 2, a plane 5)", SEQUENCES)
-    min_displacement: float = gate(
-        0.02, "share", "median displacement, of the width of the image", "chosen on rendered rooms"
-    )
+    min_displacement: float = gate(0.02, "share", "median shift, of the image's width", "chosen on rendered rooms")
     min_points: int = gate(60, "points", "points followed and placed", "chosen on rendered rooms")
     min_inliers: float = gate(0.6, "share", "share of the points in front of both cameras", "chosen on rendered rooms")
-    depth_sigma: float = gate(
-        0.15, "share", "median standard deviation of the depths of the first points", "convention: depths are known"
-    )
-    max_behind: float = gate(
-        10.0, "nats", "a motion less likely by this than another one is ruled out", "derived from odds of 1 in 20 000"
-    )
+    depth_sigma: float = gate(0.15, "share", "median deviation of the first depths", "convention: depths are known")
+    max_behind: float = gate(10.0, "nats", "by which another motion rules one out", "derived from odds of 1 in 20 000")
     max_error: float = gate(1.0, "px", "distance from an epipolar line", "convention: one pixel")
-    max_depth: float = gate(
-        50.0, "median depths", "points beyond tell no position", "derived from their share in it: a thousandth or less"
-    )
-    least_cost: float = gate(
-        1e-4, "nats", "cost of a point that fits exactly", "convention: a hundredth of its standard deviation"
-    )
+    max_depth: float = gate(50.0, "median depths", "points beyond tell no position", "derived from their share: 1e-3")
+    least_cost: float = gate(1e-4, "nats", "cost of a point that fits exactly", "convention: a hundredth of sigma")
     same_turn: float = gate(0.01, "rad", "two motions are one where they differ by less", "convention: half a degree")
     same_shift: float = gate(0.1, "share", "and by less than this share of the motion", "convention: a tenth")
 
@@ -69,9 +58,7 @@ class FindingGates:
     near: float = gate(6.0, "px", "a feature agrees within this distance; coarse scales are not precise", SEQUENCES)
     search: float = gate(0.07, "share", "where features are looked for around a guess, of the image's width", SEQUENCES)
     max_refined: int = gate(4, "poses", "proposals that are refined", "cost: time to find a pose")
-    same_shift: float = gate(
-        0.01, "share", "a proposal this near to an earlier one is left out, of the depth", "cost: time"
-    )
+    same_shift: float = gate(0.01, "share", "of the depth, from a proposal tried before", "cost: time")
     same_turn: float = gate(0.006, "rad", "and this angle", "cost: time to find a pose")
     min_inliers: int = gate(10, "points", "points that agree on a proposal", SEQUENCES)
     max_error: float = gate(4.0, "px", "distance at which they do", SEQUENCES)
@@ -85,14 +72,10 @@ class FindingGates:
 class VerificationGates:
     """Whether a pose is to be believed."""
 
-    min_followed: int = gate(
-        6, "score", "measurements that a pose is estimated from (line 2, plane 3)", "derived from 6 unknowns"
-    )
+    min_followed: int = gate(6, "score", "that a pose is estimated from (line 2, plane 3)", "derived from 6 unknowns")
     nearest: int = gate(3, "keyframes", "keyframes that are tried first", "cost: time to find a pose")
     tried: int = gate(30, "keyframes", "keyframes that are tried at all", "cost: time to find a pose")
-    min_score: float = gate(
-        18.0, "score", "points and lines (planes, if they are all) that agree with a pose", SEQUENCES
-    )
+    min_score: float = gate(18.0, "score", "points and lines (or planes alone) that agree with a pose", SEQUENCES)
     looser: float = gate(0.75, "share", "of a score, for a pose found by features or without points", SEQUENCES)
     min_share: float = gate(0.35, "share", "share of the searched points and lines that agree", SEQUENCES)
     most: float = gate(0.65, "share", "of the searched points and lines that agree, for a doubtful pose", SEQUENCES)
@@ -129,11 +112,7 @@ class LoopGates:
     shared: int = gate(30, "points", "a keyframe that shares so much with the new one is no loop", SEQUENCES)
     shift_sigma: float = gate(0.02, "share", "noise of a relative position, of the median depth, and scale", SEQUENCES)
     turn_sigma: float = gate(0.01, "rad", "noise of a relative rotation", SEQUENCES)
-    jump: float = gate(
-        6.0, "sigma", "a loop is nearer to the path, on the average of its components: places are alike", SEQUENCES
-    )
-    held_by: int = gate(
-        8, "keyframes", "earlier keyframes that hold each one in the pose graph", "cost: time of a loop"
-    )
+    jump: float = gate(6.0, "sigma", "of a loop from the path, mean of its components: places are alike", SEQUENCES)
+    held_by: int = gate(8, "keyframes", "earlier ones that hold each in the pose graph", "cost: time of a loop")
     max_iterations: int = gate(30, "steps", "steps of the pose graph", "cost: converges in fewer")
     final_iterations: int = gate(15, "steps", "steps of the adjustment at the end, twice", "cost: converges in fewer")

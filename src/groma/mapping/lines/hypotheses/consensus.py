@@ -29,9 +29,7 @@ from groma.mapping.lines.hypotheses.proposals import Proposals
 class ConsensusGates:
     """When proposals agree."""
 
-    num_seeds: int = gate(
-        3, "proposals", "per segment that are fused with what agrees, and compared", "cost: the best is among the first"
-    )
+    num_seeds: int = gate(3, "proposals", "of a segment, fused and compared", "cost: one of them is the best")
     fusing_rounds: int = gate(3, "rounds", "of fusing and comparing again", "cost: the second changes little")
     half_weight: float = gate(4.0, "sigma^2", "squared distance at which a proposal counts half", LINE_MAPS)
 

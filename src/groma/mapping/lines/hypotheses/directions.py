@@ -23,7 +23,7 @@ from groma._typing import FloatArray
 from groma.execution import map_work
 from groma.features.segments import Segments
 from groma.features.vanishing_points import find_vanishing_points
-from groma.gates import LINE_MAPS, gate
+from groma.gates import LINE_MAPS, SEARCH, gate
 from groma.geometry import quaternion
 from groma.mapping.lines.views import LineViews
 from groma.scene import Scene
@@ -33,9 +33,7 @@ from groma.scene import Scene
 class DirectionGates:
     """Which segments tell vanishing points, and which vanishing points tell depth."""
 
-    num_voters: int = gate(
-        200, "segments", "longest of an image, which look for vanishing points", "cost: time of a search"
-    )
+    num_voters: int = gate(200, "segments", "longest of an image, that look for vanishing points", SEARCH)
     min_voters: int = gate(10, "segments", "fewer tell no vanishing point", "chosen on benchmarks/lines.py")
     max_sigma: float = gate(0.01, "rad", "of a direction that tells something", LINE_MAPS)
 

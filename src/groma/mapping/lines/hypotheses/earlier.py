@@ -29,9 +29,7 @@ class EarlierGates:
     """When two images have moved."""
 
     num_points: int = gate(100, "points", "of an image that tell how its epipolar lines moved", "cost: of a quantile")
-    moved_share: float = gate(
-        0.1, "share", "of points that moved, or their epipolar lines: search again", "chosen on castle, fountain"
-    )
+    moved_share: float = gate(0.1, "share", "of points that moved, or epipolar lines", "chosen on castle, fountain")
 
 
 GATES = EarlierGates()

@@ -28,21 +28,13 @@ _ROWS_AT_ONCE = 8192
 class TrackGates:
     """Which segments observe a line, and which lines are one."""
 
-    fitting_rounds: int = gate(
-        3, "rounds", "how often a line is fitted and its observations tested again", "cost: most change in the first"
-    )
+    fitting_rounds: int = gate(3, "rounds", "of fitting a line and testing observations", "cost: most is in the first")
 
-    min_overlap_px: float = gate(
-        5.0, "px", "shortest projection of a line, and shortest overlap with a segment", LINE_MAPS
-    )
+    min_overlap_px: float = gate(5.0, "px", "shortest projection of a line, and overlap with a segment", LINE_MAPS)
     min_common_images: int = gate(2, "images", "images that show that two lines are one", LINE_MAPS)
-    min_observations: int = gate(
-        4, "observations", "of a line whose residuals tell the noise", "derived from two of four numbers being left"
-    )
+    min_observations: int = gate(4, "observations", "of a line that tells the noise", "derived from two of four left")
     min_residuals: int = gate(30, "observations", "fewer tell nothing of the noise", "derived from 10 % of its error")
-    noise_quantile: float = gate(
-        0.75, "quantile", "of the residuals, over that of normal ones", "chosen on benchmarks/lines.py: tails are heavy"
-    )
+    noise_quantile: float = gate(0.75, "quantile", "of residuals, over normal ones", LINE_MAPS + ": tails are heavy")
 
 
 @dataclass(frozen=True, eq=False)
