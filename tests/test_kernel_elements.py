@@ -219,3 +219,21 @@ def test_ranges_are_those_of_python(kind):
 def test_ranges_in_ranges():
     for count in range(7):
         assert _nested(count) == _nested.py_func(count)
+
+
+@loop
+def _quotients(a, b, out):
+    for i in range(len(a)):
+        out[i] = a[i] / b[i]
+        out[i] += 1.0 / b[i]
+
+
+def test_complex_numbers_are_divided_as_numpy_does():
+    numbers = np.array([1.0, -2.0j, 3.0 + 4.0j, 1e200 - 1e-200j, 0.0])
+    a, b = (numbers[index] for index in np.indices((5, 5)).reshape(2, -1))
+    out = np.empty_like(a)
+    _quotients(a, b, out)
+    with np.errstate(all="ignore"):
+        expected = a / b + 1.0 / b
+    np.testing.assert_allclose(out[b != 0.0], expected[b != 0.0], rtol=1e-14)
+    assert not np.isfinite(out[b == 0.0]).any()

@@ -2,6 +2,7 @@
 """What the compiler is told sooner is what Numba finds out; arguments come back as they were."""
 
 import itertools
+import math
 import operator
 import sys
 
@@ -127,3 +128,17 @@ def test_setting_and_attributes_mean_what_they_mean_to_numba():
     for attribute in ("shape", "size", "T", "nothing_of_this_name"):
         for _ in range(2):
             assert ours.resolve_getattr(array, attribute) == context.resolve_getattr(array, attribute)
+
+
+@loop
+def _finite(a, b):
+    z = complex(a - b, a)
+    return np.isfinite(a - b), math.isfinite(a * b + a), np.isfinite(np.array([a - b]))[0], np.isfinite(z)
+
+
+@pytest.mark.parametrize("b", [1.0, np.inf, -np.inf, np.nan])
+@pytest.mark.parametrize("a", [0.0, 1.7e308, np.inf, np.nan])
+def test_sums_are_finite_only_if_they_are(a, b):
+    """Numba's own test, whether a sum less the same sum is a number, is true of all once operations are regrouped."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        assert _finite(a, b) == _finite.py_func(np.float64(a), np.float64(b))

@@ -13,6 +13,7 @@ are to be checked.
 
 from __future__ import annotations
 
+import operator
 from functools import cache, cached_property
 from typing import Any
 
@@ -119,6 +120,21 @@ class _Lower(Lower):
         elif expr.op in _PARTS and isinstance(kind, types.Pair) and not self._is_counted(resty):
             return self.builder.extract_value(self.loadvar(expr.value.name), _PARTS[expr.op])
         return super().lower_expr(resty, expr)
+
+    def lower_binop(self, resty: Any, expr: Any, op: Any) -> Any:
+        """Divide complex numbers as NumPy does, also by zero, where Numba raises an error whatever it is told."""
+        if op is not operator.truediv or not isinstance(resty, types.Complex):
+            return super().lower_binop(resty, expr, op)
+        from numba.np.npyfuncs import np_complex_div_impl
+
+        signature = self.fndesc.calltypes[expr]
+        sides = zip((expr.lhs, expr.rhs), signature.args, strict=True)
+        given = [
+            self.context.cast(self.builder, self.loadvar(side.name), self.typeof(side.name), kind)
+            for side, kind in sides
+        ]
+        found = np_complex_div_impl(self.context, self.builder, signature, given)
+        return self.context.cast(self.builder, found, signature.return_type, resty)
 
     def _range(self, expr: Any, kind: Any) -> Any:
         """Return start, end and step."""

@@ -7,6 +7,9 @@ Python such as ``max``: a tenth of the time that Python takes of a compilation. 
 and tells whoever listens of every call of LLVM, though nobody does: another tenth. To count a reference to an array it
 takes the whole description apart: a fifth of the instructions for LLVM, without effect.
 
+One answer is not Numba's: whether a number is finite. Numba tests ``x - x``, which is zero, and not NaN, for whatever
+sum ``x`` is, as soon as operations may be regrouped.
+
 In come steps and classes of Numba's compiler; out come ``TypeInference``, one of the steps, and ``remembering``, inside
 which code is made.
 """
@@ -21,6 +24,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import llvmlite.binding as llvm
+from llvmlite import ir
 from numba.core import event, types
 from numba.core.compiler_machinery import register_pass
 from numba.core.runtime.context import NRTContext
@@ -124,15 +128,31 @@ def _counts(self: Any, builder: Any, ty: Any, val: Any) -> list[Any]:
     return _find_counts(self, builder, ty, val)
 
 
+def _is_finite(builder: Any, val: Any) -> Any:
+    """Take the place of Numba's ``is_finite``: whether the absolute value is below infinity."""
+    size = builder.call(builder.module.declare_intrinsic("llvm.fabs", [val.type]), [val])
+    return builder.fcmp_ordered("<", size, ir.Constant(val.type, float("inf")))
+
+
 @contextmanager
 def remembering() -> Iterator[None]:
     """Let Numba look for the meaning of operators once; for a thread that holds the lock of the compiler."""
+    from numba.cpython import mathimpl as of_python  # with much else that loaded code does not need
+    from numba.np.math import mathimpl as of_numpy
+
     lock: Any = llvm.ffi.lib._lock
-    before = BaseFunction.get_call_type, NRTContext.get_meminfos, lock._cblist
-    BaseFunction.get_call_type, NRTContext.get_meminfos = _remembered_call_type, _counts
-    if not event._registered.get(_LLVM_CALLS):
-        lock._cblist = []
+    places = (
+        (BaseFunction, "get_call_type", _remembered_call_type),
+        (NRTContext, "get_meminfos", _counts),
+        (of_python, "is_finite", _is_finite),
+        (of_numpy, "is_finite", _is_finite),
+        (lock, "_cblist", lock._cblist if event._registered.get(_LLVM_CALLS) else []),
+    )
+    before = [getattr(owner, name) for owner, name, _ in places]
+    for owner, name, ours in places:
+        setattr(owner, name, ours)
     try:
         yield
     finally:
-        BaseFunction.get_call_type, NRTContext.get_meminfos, lock._cblist = before
+        for (owner, name, _), numbas in zip(places, before, strict=True):
+            setattr(owner, name, numbas)
