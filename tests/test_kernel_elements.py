@@ -237,3 +237,19 @@ def test_complex_numbers_are_divided_as_numpy_does():
         expected = a / b + 1.0 / b
     np.testing.assert_allclose(out[b != 0.0], expected[b != 0.0], rtol=1e-14)
     assert not np.isfinite(out[b == 0.0]).any()
+
+
+@loop
+def _squares(x, n):
+    return x**2, n**2, (x + n) ** 2, np.float32(x) ** 2, x**3, np.float64(SQUARED**2), x**SQUARED
+
+
+SQUARED = 2
+
+
+@pytest.mark.parametrize("x", [-1.5, 0.1, 1e200, np.nan])
+def test_squares_are_products(x):
+    with np.errstate(over="ignore", invalid="ignore"):
+        n, single = np.int64(-7), np.float32(x)
+        expected = (x * x, 49, (x + n) * (x + n), single * single, x * x * x, 4.0, x * x)
+    np.testing.assert_array_equal(_squares(x, n), expected)

@@ -10,7 +10,8 @@ import llvmlite.binding as llvm
 import numba
 import numpy as np
 import pytest
-from numba.core import event, types
+from numba import extending
+from numba.core import compiler, event, types
 from numba.core.registry import cpu_target
 
 from groma._kernels import shortcuts
@@ -142,3 +143,33 @@ def test_sums_are_finite_only_if_they_are(a, b):
     """Numba's own test, whether a sum less the same sum is a number, is true of all once operations are regrouped."""
     with np.errstate(invalid="ignore", over="ignore"):
         assert _finite(a, b) == _finite.py_func(np.float64(a), np.float64(b))
+
+
+def test_options_are_those_of_numba():
+    flags = compiler.Flags()
+    flags.nrt, flags.error_model = True, "numpy"
+    expected = flags.values()
+    with shortcuts.remembering():
+        assert flags.values() == expected
+        assert list(flags.values()) == list(expected)
+        assert flags == flags.copy()
+        assert flags != compiler.Flags()
+
+
+def test_what_is_registered_later_is_found():
+    calls = []
+    target = cpu_target.target_context
+
+    def typed(context, argument):
+        def lowered(context, builder, signature, arguments):
+            calls.append(signature)
+            return arguments[0]
+
+        return argument(argument), lowered
+
+    with shortcuts.remembering():
+        target.refresh()
+        assert target.groma_registered == shortcuts._num_registered(target)
+        later = extending.intrinsic(typed)
+        assert numba.njit(lambda x: later(x) + 1.0)(2.0) == 3.0
+    assert calls
