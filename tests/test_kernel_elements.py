@@ -219,3 +219,37 @@ def test_ranges_are_those_of_python(kind):
 def test_ranges_in_ranges():
     for count in range(7):
         assert _nested(count) == _nested.py_func(count)
+
+
+@loop
+def _quotients(a, b, out):
+    for i in range(len(a)):
+        out[i] = a[i] / b[i]
+        out[i] += 1.0 / b[i]
+
+
+def test_complex_numbers_are_divided_as_numpy_does():
+    numbers = np.array([1.0, -2.0j, 3.0 + 4.0j, 1e200 - 1e-200j, 0.0])
+    a, b = (numbers[index] for index in np.indices((5, 5)).reshape(2, -1))
+    out = np.empty_like(a)
+    _quotients(a, b, out)
+    with np.errstate(all="ignore"):
+        expected = a / b + 1.0 / b
+    np.testing.assert_allclose(out[b != 0.0], expected[b != 0.0], rtol=1e-14)
+    assert not np.isfinite(out[b == 0.0]).any()
+
+
+@loop
+def _squares(x, n):
+    return x**2, n**2, (x + n) ** 2, np.float32(x) ** 2, x**3, np.float64(SQUARED**2), x**SQUARED
+
+
+SQUARED = 2
+
+
+@pytest.mark.parametrize("x", [-1.5, 0.1, 1e200, np.nan])
+def test_squares_are_products(x):
+    with np.errstate(over="ignore", invalid="ignore"):
+        n, single = np.int64(-7), np.float32(x)
+        expected = (x * x, 49, (x + n) * (x + n), single * single, x * x * x, 4.0, x * x)
+    np.testing.assert_array_equal(_squares(x, n), expected)

@@ -96,3 +96,16 @@ def _told(values):
 def test_generators_and_plain_python_inside():
     assert list(_halves(np.array([2.0, 4.0]))) == [1.0, -2.0, 2.0, -4.0]
     assert _told(np.array([2.0, 4.0])) == 8.0
+
+
+def _with_dictionary(value):
+    return {1: value, **{2: 2 * value}}
+
+
+@pytest.mark.parametrize(("function", "count"), [(_nested, 0), (_with_dictionary, 2)])
+def test_steps_are_taken_where_there_is_something_to_find(function, count, monkeypatch):
+    taken = []
+    monkeypatch.setattr(lifetimes, "_post_process", lambda _self, steps, _function: taken.extend(steps))
+    described = run_frontend(function)
+    lifetimes._post_process_on_demand(None, lifetimes._LOOKING, described)
+    assert len(taken) == count

@@ -2,6 +2,7 @@
 """What the compiler is told sooner is what Numba finds out; arguments come back as they were."""
 
 import itertools
+import math
 import operator
 import sys
 
@@ -9,7 +10,8 @@ import llvmlite.binding as llvm
 import numba
 import numpy as np
 import pytest
-from numba.core import event, types
+from numba import extending
+from numba.core import compiler, event, types
 from numba.core.registry import cpu_target
 
 from groma._kernels import shortcuts
@@ -127,3 +129,47 @@ def test_setting_and_attributes_mean_what_they_mean_to_numba():
     for attribute in ("shape", "size", "T", "nothing_of_this_name"):
         for _ in range(2):
             assert ours.resolve_getattr(array, attribute) == context.resolve_getattr(array, attribute)
+
+
+@loop
+def _finite(a, b):
+    z = complex(a - b, a)
+    return np.isfinite(a - b), math.isfinite(a * b + a), np.isfinite(np.array([a - b]))[0], np.isfinite(z)
+
+
+@pytest.mark.parametrize("b", [1.0, np.inf, -np.inf, np.nan])
+@pytest.mark.parametrize("a", [0.0, 1.7e308, np.inf, np.nan])
+def test_sums_are_finite_only_if_they_are(a, b):
+    """Numba's own test, whether a sum less the same sum is a number, is true of all once operations are regrouped."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        assert _finite(a, b) == _finite.py_func(np.float64(a), np.float64(b))
+
+
+def test_options_are_those_of_numba():
+    flags = compiler.Flags()
+    flags.nrt, flags.error_model = True, "numpy"
+    expected = flags.values()
+    with shortcuts.remembering():
+        assert flags.values() == expected
+        assert list(flags.values()) == list(expected)
+        assert flags == flags.copy()
+        assert flags != compiler.Flags()
+
+
+def test_what_is_registered_later_is_found():
+    calls = []
+    target = cpu_target.target_context
+
+    def typed(context, argument):
+        def lowered(context, builder, signature, arguments):
+            calls.append(signature)
+            return arguments[0]
+
+        return argument(argument), lowered
+
+    with shortcuts.remembering():
+        target.refresh()
+        assert target.groma_registered == shortcuts._num_registered(target)
+        later = extending.intrinsic(typed)
+        assert numba.njit(lambda x: later(x) + 1.0)(2.0) == 3.0
+    assert calls

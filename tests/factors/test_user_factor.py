@@ -124,6 +124,17 @@ def test_nan_and_forgotten_rows_are_degenerate():
     np.testing.assert_array_equal(out, record[:, :, 1])
 
 
+def test_a_complex_step_that_divides_by_zero_is_degenerate():
+    @factor("my_quotient", slots=[("x", "vector", 2)], residual_size=1, derivative="complex")
+    def quotient(data, x, out):
+        out[0] = x[0] + 1.0 / (1.0 + 1.0 / x[1])  # finite at 0
+
+    x = np.array([[1.0, 0.0], [1.0, 1.0]])
+    record, degenerate = linearized(quotient(x=Ref("x", [0, 1])), (x,), [2])
+    assert degenerate == 1
+    np.testing.assert_allclose(record[:, 0], [[0.0, 0.0, 0.0], [1.0, 0.25, 1.5]], rtol=1e-12)
+
+
 def test_writing_to_the_arguments_changes_nothing():
     @factor("my_vandal", slots=[("x", "point")], residual_size=1)
     def vandal(data, x, out):

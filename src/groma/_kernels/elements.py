@@ -13,6 +13,7 @@ are to be checked.
 
 from __future__ import annotations
 
+import operator
 from functools import cache, cached_property
 from typing import Any
 
@@ -119,6 +120,30 @@ class _Lower(Lower):
         elif expr.op in _PARTS and isinstance(kind, types.Pair) and not self._is_counted(resty):
             return self.builder.extract_value(self.loadvar(expr.value.name), _PARTS[expr.op])
         return super().lower_expr(resty, expr)
+
+    def lower_binop(self, resty: Any, expr: Any, op: Any) -> Any:
+        """Square by a product, and divide complex numbers as NumPy does.
+
+        Numba has a loop for powers, and an error for complex division by zero, whatever it is told.
+        """
+        signature = self.fndesc.calltypes[expr]
+        kind, count = signature.return_type, self.typeof(expr.rhs.name)
+        is_square = op is operator.pow and isinstance(count, types.IntegerLiteral) and count.literal_value == 2
+        is_square &= isinstance(kind, types.Float | types.Integer) and kind == signature.args[0]
+        if not is_square and not (op is operator.truediv and isinstance(kind, types.Complex)):
+            return super().lower_binop(resty, expr, op)
+        first, second = (
+            self.context.cast(self.builder, self.loadvar(side.name), self.typeof(side.name), wanted)
+            for side, wanted in zip((expr.lhs, expr.rhs), signature.args, strict=True)
+        )
+        build: Any = self.builder
+        if is_square:
+            found = (build.fmul if isinstance(kind, types.Float) else build.mul)(first, first)
+        else:
+            from numba.np.npyfuncs import np_complex_div_impl
+
+            found = np_complex_div_impl(self.context, build, signature, (first, second))
+        return self.context.cast(build, found, kind, resty)
 
     def _range(self, expr: Any, kind: Any) -> Any:
         """Return start, end and step."""

@@ -14,14 +14,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from numba.core import analysis, ir, transforms
+from numba.core import analysis, interpreter, ir, transforms
+from numba.core.interpreter import Interpreter
 from numba.core.postproc import PostProcessor, VariableLifetime
 
 #: What refers to no variable.
 _PLAIN = frozenset((str, int, float, bool, type(None), ir.Loc, ir.Const, ir.Global, ir.FreeVar, ir.Arg))
 #: Blocks of ``with`` may be compiled in another way, which reads more.
-_WITH = dis.opmap.get("BEFORE_WITH", dis.opmap.get("LOAD_SPECIAL"))
+_WITH: Any = dis.opmap.get("BEFORE_WITH", dis.opmap.get("LOAD_SPECIAL"))
+#: What two of the steps after the translation of bytecode look for: such blocks, and joined dictionaries.
+_LOOKED_FOR = frozenset((_WITH, dis.opmap["DICT_UPDATE"]))
 _process, _list_variables, _uses_and_definitions = PostProcessor.run, ir.Inst._rec_list_vars, analysis.compute_use_defs
+_post_process = Interpreter.post_process
+_LOOKING = (interpreter.peep_hole_delete_with_exit, interpreter.peep_hole_fuse_dict_add_updates)
 
 
 def _process_on_demand(self: Any, emit_dels: bool = False, extend_lifetimes: bool = False) -> None:
@@ -35,6 +40,13 @@ def _process_on_demand(self: Any, emit_dels: bool = False, extend_lifetimes: boo
     function.generator_info = None
     if emit_dels:
         self._insert_var_dels(extend_lifetimes=extend_lifetimes)
+
+
+def _post_process_on_demand(self: Any, peepholes: Any, func_ir: Any) -> Any:
+    """Take the place of :meth:`Interpreter.post_process`: leave out steps that look for what is not there."""
+    if _LOOKED_FOR.isdisjoint(func_ir.func_id.code.co_code[::2]):
+        peepholes = [step for step in peepholes if step not in _LOOKING]
+    return _post_process(self, peepholes, func_ir)
 
 
 def _variables(self: Any, val: Any) -> list[Any]:
@@ -82,7 +94,9 @@ def on_demand() -> Iterator[None]:
     """Let Numba find uses when it needs them; for a thread that holds the lock of the compiler."""
     before = PostProcessor.run, ir.Inst._rec_list_vars, analysis.compute_use_defs
     PostProcessor.run, ir.Inst._rec_list_vars, analysis.compute_use_defs = _process_on_demand, _variables, _uses
+    Interpreter.post_process = _post_process_on_demand
     try:
         yield
     finally:
         PostProcessor.run, ir.Inst._rec_list_vars, analysis.compute_use_defs = before
+        Interpreter.post_process = _post_process

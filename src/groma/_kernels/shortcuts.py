@@ -5,7 +5,11 @@ Numba looks for the meaning of ``a + b`` among some fifteen rules, in every func
 is remembered by the types of the operands, as are numbers of arrays, attributes such as ``shape``, and functions of
 Python such as ``max``: a tenth of the time that Python takes of a compilation. Numba asks again when it makes code,
 and tells whoever listens of every call of LLVM, though nobody does: another tenth. To count a reference to an array it
-takes the whole description apart: a fifth of the instructions for LLVM, without effect.
+takes the whole description apart: a fifth of the instructions for LLVM, without effect. Where it has no code for
+something it goes through all registries of code anew, some seven times in each function.
+
+One answer is not Numba's: whether a number is finite. Numba tests ``x - x``, which is zero, and not NaN, for whatever
+sum ``x`` is, as soon as operations may be regrouped.
 
 In come steps and classes of Numba's compiler; out come ``TypeInference``, one of the steps, and ``remembering``, inside
 which code is made.
@@ -16,14 +20,19 @@ from __future__ import annotations
 import builtins
 import math
 import operator
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import llvmlite.binding as llvm
+from llvmlite import ir
 from numba.core import event, types
+from numba.core.base import BaseContext
 from numba.core.compiler_machinery import register_pass
 from numba.core.runtime.context import NRTContext
+from numba.core.targetconfig import TargetConfig
 from numba.core.typed_passes import NopythonTypeInference
 from numba.core.types.functions import BaseFunction
 
@@ -37,7 +46,7 @@ _KNOWN = frozenset(
 _meanings: dict[Any, tuple[Any, Any]] = {}
 #: What Numba calls the events around each call of LLVM.
 _LLVM_CALLS = "numba:llvm_lock"
-_call_type, _find_counts = BaseFunction.get_call_type, NRTContext.get_meminfos
+_call_type, _find_counts, _refresh = BaseFunction.get_call_type, NRTContext.get_meminfos, BaseContext.refresh
 
 
 def _is_simple(kind: Any) -> bool:
@@ -124,15 +133,56 @@ def _counts(self: Any, builder: Any, ty: Any, val: Any) -> list[Any]:
     return _find_counts(self, builder, ty, val)
 
 
+def _num_registered(context: Any) -> int:
+    """Return what grows when more code is registered: by a new module, or in one that is here."""
+    registries = (*context._registries, *context.typing_context._registries)
+    return len(sys.modules) + sum(len(items) for one in registries for items in vars(one).values())
+
+
+def _refreshed(self: Any) -> None:
+    """Take the place of :meth:`BaseContext.refresh`: look for new code if there may be some."""
+    if getattr(self, "groma_registered", None) != _num_registered(self):
+        _refresh(self)
+        self.groma_registered = _num_registered(self)
+
+
+@cache
+def _defaults(kind: Any) -> dict[str, Any]:
+    return {name: option.default for name, option in kind.options.items()}
+
+
+def _options(self: Any) -> dict[str, Any]:
+    """Take the place of :meth:`TargetConfig.values`, which is asked whenever options are compared."""
+    return {**_defaults(type(self)), **self._values}
+
+
+def _is_finite(builder: Any, val: Any) -> Any:
+    """Take the place of Numba's ``is_finite``: whether the absolute value is below infinity."""
+    size = builder.call(builder.module.declare_intrinsic("llvm.fabs", [val.type]), [val])
+    return builder.fcmp_ordered("<", size, ir.Constant(val.type, float("inf")))
+
+
 @contextmanager
 def remembering() -> Iterator[None]:
     """Let Numba look for the meaning of operators once; for a thread that holds the lock of the compiler."""
+    from numba.cpython import mathimpl as of_python  # with much else that loaded code does not need
+    from numba.np.math import mathimpl as of_numpy
+
     lock: Any = llvm.ffi.lib._lock
-    before = BaseFunction.get_call_type, NRTContext.get_meminfos, lock._cblist
-    BaseFunction.get_call_type, NRTContext.get_meminfos = _remembered_call_type, _counts
-    if not event._registered.get(_LLVM_CALLS):
-        lock._cblist = []
+    places = (
+        (BaseFunction, "get_call_type", _remembered_call_type),
+        (NRTContext, "get_meminfos", _counts),
+        (BaseContext, "refresh", _refreshed),
+        (TargetConfig, "values", _options),
+        (of_python, "is_finite", _is_finite),
+        (of_numpy, "is_finite", _is_finite),
+        (lock, "_cblist", lock._cblist if event._registered.get(_LLVM_CALLS) else []),
+    )
+    before = [getattr(owner, name) for owner, name, _ in places]
+    for owner, name, ours in places:
+        setattr(owner, name, ours)
     try:
         yield
     finally:
-        BaseFunction.get_call_type, NRTContext.get_meminfos, lock._cblist = before
+        for (owner, name, _), numbas in zip(places, before, strict=True):
+            setattr(owner, name, numbas)
