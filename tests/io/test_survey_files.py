@@ -176,6 +176,20 @@ def test_local_and_known_systems_do_not_mix():
         common_frame([places([[1, 2, 3]], ""), places([[500000, 5300000, 0]], "EPSG:32632")])
 
 
+@pytest.mark.parametrize(
+    "places, said",
+    [
+        (["1 2 70", "1 2 70.5", "3 4 71"], "points that differ in height alone: (1, 2, 70) and (1, 2, 70.5). If they"),
+        (["1 2 70", "1 3 70", "3 4 70"], "all 3 control points have the height 70; it was hardly measured"),
+        (["1 2 70", "1 3 71", "3 2 72", "- - -"], None),
+    ],
+)
+def test_heights_that_are_doubtful_are_told(tmp_path, places, said):
+    text = "".join(f"{place} 5 6 a.jpg\n" for place in places)
+    notes = read_control(written(tmp_path, "gcp_list.txt", "EPSG:32611\n" + text)).places.notes
+    assert len(notes) == (said is not None) and all(said in note for note in notes)
+
+
 def test_gcp_list_of_opendronemap(tmp_path):
     text = (
         "WGS84 UTM 11N\n235269.88\t3811198.11\t0.0\t1203.0\t764.0\tIMG_0037.JPG\tgcp02\n"

@@ -113,6 +113,14 @@ def test_a_bad_step_is_refused_and_the_damping_raised():
     assert not any(record.accepted for record in report.history)
 
 
+@pytest.mark.parametrize("promised, damping", [(4.0, 2e-10), (40.0, 6.4e-9), (2e5, 2.097152e-4)])
+def test_dampings_that_would_not_change_a_refused_step_are_skipped(promised, damping):
+    """The damping grows by 2, 4, 8, ... in turn, until what it withholds, 2 at 1e-10, would be what was promised."""
+    rule = NielsenDamping(1e-10)
+    assert rule.refuse(At(cost=1.0, promised=promised, withheld=2.0)) is None
+    assert rule.value == pytest.approx(damping)
+
+
 def test_a_rescued_step_is_accepted():
     problem = Curve(cost=lambda x: 0.5 * x * x if x > 4.0 else 100.0)
     problem.rescue = lambda trial: problem.at(5.0)

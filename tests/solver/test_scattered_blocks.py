@@ -30,9 +30,12 @@ class Counting(Alone):
 
 @pytest.mark.parametrize("shared_intrinsics", [None, True, False])
 def test_products_find_what_the_formed_system_finds(shared_intrinsics):
-    """Blocks between poses, and between poses and shared or private calibrations."""
+    """Blocks between poses, and between poses and shared or private calibrations.
+
+    Three steps: with private calibrations a fourth follows directions so weak that rounding decides where it ends.
+    """
     problem = scene_problem(num_cameras=6, num_points=60, num_lines=20, shared_intrinsics=shared_intrinsics)
-    shards, options = cut(problem, 4), SolverOptions(linear_solver="pcg", threads=1, max_iterations=6)
+    shards, options = cut(problem, 4), SolverOptions(linear_solver="pcg", threads=1, max_iterations=3)
     found = [
         solve_shards(problem.variables, shards, dataclasses.replace(options, shared_system=system))
         for system in ("formed", "products")

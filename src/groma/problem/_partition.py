@@ -23,7 +23,7 @@ def free_groups(problem: Problem) -> list[str]:
     return [name for name, group in problem.variables.items() if name in used and not group.is_constant]
 
 
-def _couplings(problem: Problem, groups: set[str]) -> list[tuple[str, str, str]]:
+def couplings(problem: Problem, groups: set[str]) -> list[tuple[str, str, str]]:
     """Return (factor, group, group) for every factor type that touches two variables of the given groups."""
     found = []
     for factor in problem.factors:
@@ -45,10 +45,10 @@ def choose_landmarks(problem: Problem, eliminate: str | tuple[str, ...], warning
     """
     free = free_groups(problem)
     if eliminate == "auto":
-        if not _couplings(problem, set(free)):
+        if not couplings(problem, set(free)):
             return tuple(free)  # nothing is coupled: every variable is an independent problem
         chosen = [name for name in free if problem.variables[name].manifold.kind in LANDMARK_KINDS]
-        while coupled := _couplings(problem, set(chosen)):
+        while coupled := couplings(problem, set(chosen)):
             name, first, second = coupled[0]
             smaller = min(first, second, key=lambda group: len(problem.variables[group]))
             if len(problem.variables[smaller]) > MAX_KEPT_LANDMARKS:
@@ -68,7 +68,7 @@ def choose_landmarks(problem: Problem, eliminate: str | tuple[str, ...], warning
         if name not in problem.variables:
             raise ProblemError(f"eliminate names {name!r}; the problem has the groups {sorted(problem.variables)}.")
     groups = tuple(name for name in groups if name in free)
-    for name, first, second in _couplings(problem, set(groups)):
+    for name, first, second in couplings(problem, set(groups)):
         rest = tuple(group for group in groups if group != second) or tuple(g for g in groups if g != first)
         raise ProblemError(
             f"Factor {name!r} couples two eliminated landmarks (groups {first!r} and {second!r}); their blocks are "

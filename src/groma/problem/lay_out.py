@@ -16,7 +16,7 @@ import numpy as np
 
 from groma._typing import IntArray
 from groma.problem._draft import Draft
-from groma.problem._partition import choose_landmarks, kept_classes
+from groma.problem._partition import LANDMARK_KINDS, choose_landmarks, couplings, kept_classes
 from groma.problem.layout import CHUNK_SIZE, Chunk, Eliminated, FactorLayout, Incidences, Layout
 from groma.problem.problem import Problem, under_loss
 from groma.problem.sorting import PairTable, argsort_by, distinct_pairs, first_and_last
@@ -70,6 +70,17 @@ class Layouts:
             layout = lay_out(parts.problem, eliminate)
         self._last = problem, layout, eliminate
         return parts, layout
+
+
+def landmarks_kept(layout: Layout) -> list[str]:
+    """Return the groups of landmarks in the reduced system of which no factor couples two."""
+    variables = layout.problem.variables
+    names = [member.group for kept in layout.kept for member in kept.members]
+    return [
+        name
+        for name in names
+        if variables[name].manifold.kind in LANDMARK_KINDS and not couplings(layout.problem, {name})
+    ]
 
 
 def lay_out_landmarks(layout: Layout, groups: tuple[str, ...]) -> Layout:

@@ -3,8 +3,10 @@ r"""How steps are damped: :math:`(J^\top J + \lambda D)\,\delta = -g` with :math
 
 Levenberg-Marquardt, with the rule of Nielsen: with the gain ratio :math:`\varrho` = actual / predicted decrease,
 :math:`\lambda \leftarrow \lambda \max(1/3, 1 - (2\varrho - 1)^3)` after an accepted step; after a refused one
-:math:`\lambda \leftarrow \nu\lambda`, :math:`\nu \leftarrow 2\nu`. Gauss-Newton: :math:`\lambda = 0`; a refused step
-ends the solve.
+:math:`\lambda \leftarrow \nu\lambda`, :math:`\nu \leftarrow 2\nu`. A refused step would come again where the damping is
+too little to change it: this is repeated until :math:`\lambda\,\delta^\top D\,\delta` would be what the step promised,
+which takes a third of the length from a step in one direction. Gauss-Newton: :math:`\lambda = 0`; a refused step ends
+the solve.
 
 H. B. Nielsen, *Damping parameter in Marquardt's method*, IMM-REP-1999-05, 1999.
 """
@@ -62,7 +64,10 @@ class NielsenDamping:
         self.value, self._growth = self.lowered(gain_ratio), 2.0
 
     def refuse(self, trial: Trial) -> Termination | None:  # noqa: D102
+        enough = self.value * trial.promised / trial.withheld if trial.withheld > 0.0 else 0.0
         self.value, self._growth = self.value * self._growth, self._growth * 2.0
+        while self.value < enough:
+            self.value, self._growth = self.value * self._growth, self._growth * 2.0
         return Termination.DAMPING_EXHAUSTED if self.value > MAX_DAMPING else None
 
 

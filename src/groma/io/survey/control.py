@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from groma._counted import first_of
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.bounded.documents import begins_with, member, number, of_kind, read_document, table
 from groma.bounded.text import finite, read_lines, shown
@@ -95,16 +96,25 @@ def _read_list(place: Path) -> ControlFile:
         points.append(row)
         pixels.append([numbers[3] + 0.5, numbers[4] + 0.5])
     coordinates = np.array([[np.nan] * 3 if one is None else one for one in places]).reshape(-1, 3)
-    notes = ()
-    heights = coordinates[np.isfinite(coordinates[:, 2]), 2]
-    if len(heights) > 2 and np.ptp(heights) == 0.0:
-        notes = (
-            f"{place.name}: all {len(heights)} control points have the height {heights[0]:g}; it was hardly measured.",
-        )
+    notes = tuple(f"{place.name}: {note}" for note in _doubts_of_heights(tuple(rows), coordinates))
     sigma = np.full(coordinates.shape, np.nan)
     found = Places(tuple(rows), coordinates, sigma, system, str(place), notes)
     marks = tuple(images), np.array(points, np.int64), np.array(pixels).reshape(-1, 2)
     return ControlFile(found, np.zeros(len(rows), bool), *marks, normalized=False)
+
+
+def _doubts_of_heights(names: tuple[str, ...], coordinates: FloatArray) -> list[str]:
+    """Return sentences about heights that are the same everywhere, and about points that differ in height alone."""
+    heights = coordinates[np.isfinite(coordinates[:, 2]), 2]
+    if len(heights) > 2 and np.ptp(heights) == 0.0:
+        return [f"all {len(heights)} control points have the height {heights[0]:g}; it was hardly measured."]
+    first: dict[tuple[float, ...], str] = {}
+    alike = [(first.setdefault(tuple(place[:2]), name), name) for name, place in zip(names, coordinates, strict=True)]
+    pairs = [f"{before} and {name}" for before, name in alike if before != name]
+    if not pairs:
+        return []
+    sentence = f"control points that differ in height alone: {first_of(pairs, 3)}. If they are one, give it one height."
+    return [sentence]
 
 
 def _read_opensfm(place: Path) -> ControlFile:
