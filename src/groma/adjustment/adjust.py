@@ -18,6 +18,7 @@ from groma.adjustment.fit import inliers, noise_of
 from groma.adjustment.misfit.calibration import doubtful_cameras, refuse_focal_lengths
 from groma.adjustment.misfit.lens import begin_lens_test
 from groma.adjustment.misfit.rig import rig_that_does_not_fit
+from groma.adjustment.misfit.turning import motion_that_may_be_turning
 from groma.adjustment.pixel_residuals import redundancy_of, squared_residuals_px
 from groma.adjustment.places import at_places_of
 from groma.adjustment.relation_outcome import drop_failed_relations
@@ -264,7 +265,9 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
         adjusted = with_seen_ends(adjusted, np.unique(np.concatenate(moved)))
     outcome = _outcome(scene, assembly, problem, report, relations, stage_entries(stages, reports), residuals)
     if lens is not None:
-        found = (shown := lens()) and shown.sentence, rig_that_does_not_fit(scene, problem, options.threads)
+        rig = rig_that_does_not_fit(scene, problem, options.threads)
+        free = options.refine_poses and options.refine_intrinsics
+        found = (shown := lens()) and shown.sentence, rig, motion_that_may_be_turning(adjusted, free, outcome.inliers)
         outcome = replace(outcome, warnings=(*outcome.warnings, *filter(None, found)))
     _log(outcome)
     return AdjustResult(adjusted, outcome, problem)
@@ -307,13 +310,9 @@ def _outcome(
     )
 
 
-def _is_bal(scene: Scene) -> bool:
-    return scene.num_cameras > 0 and all(name == "BAL" for name in scene.cameras.models)
-
-
 def losses_of(scene: Scene, options: AdjustOptions) -> list[Loss]:
     """Return the sequence of losses to solve with."""
-    if options.loss == "none" or (options.loss == "auto" and _is_bal(scene)):
+    if options.loss == "none" or (options.loss == "auto" and set(scene.cameras.models) == {"BAL"}):
         with_lines = options.lines and scene.num_line_observations > 0
         return [Trivial(), Trivial()] if with_lines else [Trivial()]
     if options.loss == "auto":
@@ -381,7 +380,7 @@ def assembly_options_of(
     scene: Scene, options: AdjustOptions, loss: Loss, relation_loss: Loss | None
 ) -> AssemblyOptions:
     """Return the options of the assembly: those of the same name, and what follows from the scene and the stage."""
-    is_bal = _is_bal(scene)
+    is_bal = set(scene.cameras.models) == {"BAL"}
     shared = {item.name for item in fields(AssemblyOptions)} & {item.name for item in fields(options)}
     chosen: dict[str, Any] = {name: getattr(options, name) for name in shared}
     if is_bal and options.refine_intrinsics is None:

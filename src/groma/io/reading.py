@@ -3,7 +3,7 @@
 
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -39,6 +39,17 @@ def reading(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
             f"{path} is not a usable {kind}; it may be damaged or incomplete ({reason.rstrip('.')}). Fetch or write it "
             "again."
         ) from error
+
+
+def warn_of_the_others(path: str | os.PathLike[str], num_images: Sequence[int], where: str = "") -> None:
+    """Say that of several reconstructions the largest is read; ``num_images`` are those of each, ``where`` it lies."""
+    largest, *others = sorted(num_images, reverse=True)
+    if others:
+        warnings.warn(
+            f"{path} holds {len(num_images)} reconstructions in frames of their own. The one with most images "
+            f"({largest:,}{where}) is read, the others ({', '.join(f'{count:,}' for count in others)} images) are not.",
+            stacklevel=3,
+        )
 
 
 def existing(path: str | os.PathLike[str]) -> Path:

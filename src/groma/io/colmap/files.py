@@ -42,11 +42,7 @@ def find_model(path: str | os.PathLike[str]) -> tuple[Path, Literal["binary", "t
         If none of them holds a complete model.
     """
     root = existing(path)
-    parts = sorted((p for p in (root / "sparse").glob("[0-9]*") if p.name.isdecimal()), key=lambda p: int(p.name))
-    models = [place for place in parts if _form(place) is not None]
-    if len(models) > 1:
-        models = [max(models, key=_num_images)]
-    for place in (root, root / "sparse", *models):
+    for place in (root, root / "sparse", *list(models_in_parts(root))[:1]):
         form = _form(place)
         if form is not None:
             return place, form
@@ -54,6 +50,13 @@ def find_model(path: str | os.PathLike[str]) -> tuple[Path, Literal["binary", "t
         f"{root} holds no COLMAP model: expected cameras, images and points3D, all .bin or all .txt, there, in sparse "
         f"or in sparse/0. {_remedy(root)}"
     )
+
+
+def models_in_parts(root: Path) -> dict[Path, int]:
+    """Return the models ``sparse/0``, ``sparse/1``, ... of a folder with their numbers of images, the largest first."""
+    parts = sorted((p for p in (root / "sparse").glob("[0-9]*") if p.name.isdecimal()), key=lambda p: int(p.name))
+    found = {place: _num_images(place) for place in parts if _form(place) is not None}
+    return dict(sorted(found.items(), key=lambda one: -one[1]))
 
 
 def is_model(place: Path) -> bool:

@@ -32,13 +32,14 @@ from groma.io.colmap.files import (
     damage_in_text,
     find_model,
     is_model,
+    models_in_parts,
     points_in_images,
 )
 from groma.io.colmap.load import load_pycolmap
 from groma.io.colmap.quiet import quiet
 from groma.io.colmap.to_pycolmap import colmap_camera, to_pycolmap
 from groma.io.limap.structures import Structures, read_beside, write_beside
-from groma.io.reading import reading
+from groma.io.reading import reading, warn_of_the_others
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Cameras, Frames, Images, Keypoints, PointObservations, Points, Rigs, Scene, Sensors
 from groma.scene.camera import CAMERA, OTHER
@@ -72,6 +73,8 @@ def read_colmap(path: str | os.PathLike[str]) -> Scene:
         If a camera model is not one of groma's.
     """
     folder, form = find_model(path)
+    if folder in (parts := models_in_parts(Path(path))):
+        warn_of_the_others(path, list(parts.values()), f", in {folder.relative_to(path)}")
     pycolmap = load_pycolmap()
     with reading(folder, _KIND), quiet(pycolmap):
         reconstruction, seen, points = pycolmap.Reconstruction(), None, None

@@ -32,7 +32,7 @@ from groma.io.interchange.calibration import Calibration, inverse_polynomial
 from groma.io.interchange.centred import PointRows, centred_scene, point_rows
 from groma.io.interchange.poses import rigid, size_of_image
 from groma.io.pose_conventions import NVM, NVM_MATRIX
-from groma.io.reading import existing, reading
+from groma.io.reading import existing, reading, warn_of_the_others
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Scene
 
@@ -48,7 +48,7 @@ class _Model:
 
 
 def read_nvm(path: str | os.PathLike[str]) -> Scene:
-    """Read an NVM file; of several models the one with most cameras.
+    """Read an NVM file; of several models the one with most cameras, with a warning.
 
     Raises
     ------
@@ -71,7 +71,9 @@ def read_nvm(path: str | os.PathLike[str]) -> Scene:
             models.append(model)
         if not models:
             raise FileFormatError(f"{place} has no cameras. Is it a file of matches, saved before reconstruction?")
-        return _scene(max(models, key=lambda one: len(one.names)), turn, fixed, place)
+        scene = _scene(max(models, key=lambda one: len(one.names)), turn, fixed, place)
+    warn_of_the_others(place, [len(one.names) for one in models])
+    return scene
 
 
 def _model(lines: list[str], at: int, count: int, turn: int, path: Path) -> tuple[_Model, int]:

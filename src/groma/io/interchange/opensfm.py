@@ -27,7 +27,6 @@ Reference: the documentation of OpenSfM, *Geometric models* and *Reconstruction 
 from __future__ import annotations
 
 import os
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,7 +40,7 @@ from groma.errors import FileFormatError
 from groma.io.interchange.calibration import Calibration, camera_table, fisheye, panorama, polynomial
 from groma.io.interchange.poses import file_in, points_table
 from groma.io.pose_conventions import OPENSFM
-from groma.io.reading import existing, reading
+from groma.io.reading import existing, reading, warn_of_the_others
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import PointObservations, Scene
 
@@ -81,15 +80,8 @@ def read_opensfm(path: str | os.PathLike[str]) -> Scene:
         If the file is damaged, or a kind of camera is not known.
     """
     scenes = [one.scene for one in read_opensfm_reconstructions(path)]
-    scenes.sort(key=lambda scene: -scene.num_images)
-    if len(scenes) > 1:
-        sizes = [f"{scene.num_images:,}" for scene in scenes]
-        warnings.warn(
-            f"{path} holds {len(scenes)} reconstructions in frames of their own. The one with most images "
-            f"({sizes[0]}) is read, the others ({', '.join(sizes[1:])} images) are not.",
-            stacklevel=2,
-        )
-    return scenes[0]
+    warn_of_the_others(path, [scene.num_images for scene in scenes])
+    return max(scenes, key=lambda scene: scene.num_images)
 
 
 def read_opensfm_reconstructions(path: str | os.PathLike[str]) -> tuple[OpenSfmReconstruction, ...]:
