@@ -185,3 +185,20 @@ def test_steps_are_no_pieces_of_a_wall_that_leans(step):
     marks, parts = stairs(step)
     planes, _, _ = on_fitted_planes(marks, pieces_of(marks, step * np.arange(3), parts), LEVEL, LEAST, SUPPORT)
     assert len(planes) == 3 and np.abs(planes.planes[:2, :2]).max() < 0.001
+
+
+@pytest.mark.parametrize(("signs", "number"), [([1, -1, 1, -1], 1), ([1, 1, 1, 1], 4)])
+def test_cuts_turned_against_each_other_are_pieces_of_a_wall_and_parallel_ones_are_not(signs, number):
+    """A folded wall, and one of boards: every side is flat, so that no piece says that it is rough."""
+    marks, slope = wall(0.0, num_points=1200, num_lines=0), 0.006
+    strip, place = np.divmod(marks.points[:, 0] + 2.0, 1.0)
+    strip, turned = np.clip(strip, 0, 3).astype(int), slope * np.array(signs, float)
+    marks.points[:, 2] += turned[strip] * (place - 0.5)
+    found = pieces_of(marks, np.zeros(4), [strip == k for k in range(4)])
+    found.planes[:, 0], found.planes[:, 3] = -turned, turned * (np.arange(4) - 1.5)
+    planes, points, _ = on_fitted_planes(marks, found, LEVEL, LEAST, SUPPORT)
+    assert len(planes) == number
+    if number == 1:
+        # The root mean square of heights that are even over a strip, pixels; deviations are tried in steps of 1.4.
+        assert 1.0 / 1.2 < points.deviation.max() / (100.0 * slope / np.sqrt(12.0)) < 1.2
+        assert np.abs(planes.planes[0, :2]).max() < slope / 5.0

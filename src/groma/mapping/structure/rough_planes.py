@@ -7,12 +7,14 @@ fitted to the members with this deviation in their noise is the one of most like
 are.
 
 Of a rough wall several such planes may have been found. Planes beside one with more members, within the layer in which
-members are told from clutter, are tried as pieces of one wall where members of one of them deviate: a plane is fitted
-to the members of all, with the deviation in their noise. Of what it is fitted to, those pieces stay of which most is on
-it then, by the same tests. Planes whose own noise explains them are not joined to each other: nothing says that they
-are parts of something rough. What is on one piece deviates alike, so the covariance of such a plane counts pieces, not
-features. Steps of a stepped wall are no pieces of one: the plane through them is turned against each. So the normal of
-the whole has to be that of the piece with most members, by both covariances.
+members are told from clutter, are tried as pieces of one wall where members of one of them deviate, or where three are
+turned against each other by more than their noise: then each is a cut through parts that stand at different depths. A
+plane is fitted to the members of all, with the deviation in their noise. Of what it is fitted to, those pieces stay of
+which most is on it then, by the same tests. Parallel planes that their own noise explains are not joined: nothing says
+that they are parts of something rough. What is on one piece deviates alike, so the covariance of such a plane counts
+pieces, not features. Steps of a stepped wall are no pieces of one: the plane through them is turned against all of them
+alike, while the turns of pieces scatter around that of the whole. So the mean turn of the pieces has to be none, by
+their covariances, by how they scatter beyond these, and by that of the whole.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+import scipy  # its parts are imported when something of them is first used
 
 from groma._typing import FloatArray, IntArray
 from groma.estimators.plane_fit import PlaneFit, fit_plane, plane_motions
@@ -82,7 +85,7 @@ def _fitted_in_turn(
         rough[_num_members(points, lines, len(planes)) < min_support] = 0.0
         if not rough.any():
             break
-        planes = _fitted(marks, planes, points, lines, rough)
+        planes = _fitted(marks, planes, points, lines, rough, np.flatnonzero(rough))
         points, lines = on_planes(marks, planes, level, least, known)
     return planes, points, lines
 
@@ -100,8 +103,8 @@ def _joined(
         if not free[k]:
             continue
         free[k] = False  # a piece has fewer members than what it is a piece of
-        group = _beside(marks, planes, points, lines, k, free) if rough[k] or rough[free].any() else [k]
-        if not rough[group].any():
+        group = _beside(marks, planes, points, lines, k, free)
+        if not rough[group].any() and not _contradict(planes, group, level):
             continue
         whole, group = _whole(marks, planes, points, lines, group, rough[group].max(), fitted, level)
         if len(group) > 1:
@@ -156,26 +159,55 @@ def _whole(
         new = np.full(len(planes), -1)
         new[group] = 0
         of_group = points.renumbered(new), lines.renumbered(new)
-        whole = _fitted(marks, _as_one(planes, group), *of_group, np.array([rough]))
+        whole = _fitted(marks, _as_one(planes, group), *of_group, np.array([rough]), np.zeros(1, int))
         whole, *found = fitted(whole)
         on_whole = found[0], found[1]
         parts = [_share(points, lines, b, *on_whole) > NORMAL.majority for b in group]
         if all(parts) and deviations(*on_whole, 1)[0]:
             known = _with_shared_deviations(marks, whole, *on_whole, (points, lines), np.where(new < 0, 1, 0))
-            if _same_normal(known, 0, planes, group[0], level):
+            if not _leans(known, planes, group):
                 break
             return whole, group[:1]
         group = [b for b, part in zip(group, parts, strict=True) if part] if parts[0] and not all(parts) else group[:1]
     return whole, group
 
 
-def _same_normal(one: PlaneSet, first: int, other: PlaneSet, second: int, level: float) -> bool:
-    """Whether two planes have one normal, as far as their covariances tell (chi-square test)."""
-    normal = one.planes[first, :3]
-    basis = np.stack(perpendicular(normal))
-    off = basis @ other.planes[second, :3]
-    noise = basis @ (one.covariance[first, :3, :3] + other.covariance[second, :3, :3]) @ basis.T
-    return float(off @ np.linalg.solve(noise, off)) < chi_square_gate(1.0 - level, 2)
+def _leans(whole: PlaneSet, planes: PlaneSet, group: list[int]) -> bool:
+    """Whether a plane leans against what may be its pieces, beyond how these are turned against each other."""
+    basis = np.stack(perpendicular(whole.planes[0, :3]))
+    turned, noise = _turned(basis, planes, group)
+    spread = _spread(turned, noise, 2 * len(group) - 2)
+    information = np.linalg.inv(noise + spread * np.eye(2))
+    known = np.linalg.inv(information.sum(axis=0))
+    mean = known @ np.einsum("kab,kb->a", information, turned)
+    known = known + basis @ whole.covariance[0, :3, :3] @ basis.T
+    return float(mean @ np.linalg.solve(known, mean)) > chi_square_gate(NORMAL.significance, 2)
+
+
+def _contradict(planes: PlaneSet, group: list[int], level: float) -> bool:
+    """Whether planes are turned against each other beyond their noise, three or more: two may be two walls."""
+    if len(group) < 3:
+        return False
+    basis = np.stack(perpendicular(planes.planes[group[0], :3]))
+    return _spread(*_turned(basis, planes, group), chi_square_gate(1.0 - level, 2 * len(group) - 2)) > 0.0
+
+
+def _turned(basis: FloatArray, planes: PlaneSet, group: list[int]) -> tuple[FloatArray, FloatArray]:
+    """Turns (K, 2) of planes against the normal of a basis, and their covariances (K, 2, 2)."""
+    normal = planes.planes[group, :3]
+    sign = np.sign(normal @ np.cross(basis[0], basis[1]))
+    return sign[:, None] * normal @ basis.T, basis @ planes.covariance[group, :3, :3] @ basis.T
+
+
+def _spread(turned: FloatArray, noise: FloatArray, expected: float) -> float:
+    """Variance by which turns (K, 2) scatter beyond their noise: with it their chi-square is what is expected."""
+
+    def excess(variance: float) -> float:
+        information = np.linalg.inv(noise + variance * np.eye(2))
+        mean = np.linalg.solve(information.sum(axis=0), np.einsum("kab,kb->a", information, turned))
+        return float(np.einsum("ka,kab,kb->", turned - mean, information, turned - mean)) - expected
+
+    return 0.0 if excess(0.0) <= 0.0 else float(scipy.optimize.brentq(excess, 0.0, 1.0))
 
 
 def _as_one(planes: PlaneSet, group: list[int]) -> PlaneSet:
@@ -254,16 +286,17 @@ def deviations(points: Pairs, lines: Pairs, num: int) -> FloatArray:
     return rough
 
 
-def _fitted(marks: Landmarks, planes: PlaneSet, points: Pairs, lines: Pairs, rough: FloatArray) -> PlaneSet:
-    """Return the planes with a deviation fitted to their members, weighted by their probabilities."""
+def _fitted(
+    marks: Landmarks, planes: PlaneSet, points: Pairs, lines: Pairs, rough: FloatArray, which: IntArray
+) -> PlaneSet:
+    """Return the planes, some fitted to their members, which deviate and are weighted by their probabilities."""
     plane, covariance = planes.planes.copy(), planes.covariance.copy()
 
     def fit(k: int) -> PlaneFit:
         places, noise, away, weight = members_of(marks, points, lines, k, rough[k])
         return fit_plane(places, noise + away[:, None, None] ** 2 * np.eye(3), weight)
 
-    deviating = np.flatnonzero(rough).tolist()
-    for k, found in zip(deviating, map_in_threads(fit, deviating), strict=True):
+    for k, found in zip(which.tolist(), map_in_threads(fit, which.tolist()), strict=True):
         plane[k], covariance[k] = found.plane * np.sign(found.plane[:3] @ plane[k, :3]), found.covariance
     return replace(planes, planes=plane, covariance=covariance)
 
