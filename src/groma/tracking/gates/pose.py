@@ -106,6 +106,9 @@ class VerificationGates:
     min_seen: float = gate(
         0.5, "share", "share of the points in view that agree, or features are asked too", "convention: the majority"
     )
+    odds: float = gate(
+        3.0, "nats", "lines by which a pose is more likely than others bear it out", "derived from odds of 1 in 20"
+    )
     surprise: float = gate(2.0, "sigma", "a pose farther from the prediction is verified again", SEQUENCES)
     wider: float = gate(3.0, "ratio", "the prior of a pose found by features is wider", SEQUENCES)
     jump: float = gate(6.0, "sigma", "distance of a found pose from the prediction", SEQUENCES)

@@ -347,13 +347,14 @@ def promote(track_map: TrackMap, found: Found, data: FrameFeatures) -> PointTrac
 
 
 def match_lines(
-    track_map: TrackMap, camera: TrackCamera, data: FrameFeatures, pose: FloatArray, distance: float, angle: float
-) -> tuple[FollowedSegments, LineMeasurements]:
-    """Assign detected segments to lines of the map by where a pose says they are, and how deep."""
+    track_map: TrackMap, camera: TrackCamera, data: FrameFeatures, pose: FloatArray, distance: float, angle: float,
+    among: IntArray | None = None,
+) -> tuple[FollowedSegments, LineMeasurements]:  # fmt: skip
+    """Assign detected segments to lines of the map, or some of them, by where a pose says they are, and how deep."""
     if not data.options.lines:
         return FollowedSegments.empty(), LineMeasurements.empty()
     lines, detected, gates = track_map.lines, data.detected, data.options.gates.lines
-    alive = np.flatnonzero(lines.alive)
+    alive = np.flatnonzero(lines.alive) if among is None else among
     expected, seen = expected_segments(camera, lines, alive, pose, gates)
     alive, expected = alive[seen], expected[seen]
     inverse = 1.0 / np.maximum(into(pose, lines.segment[alive].mean(axis=1))[:, 2], 1e-6)
