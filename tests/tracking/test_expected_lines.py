@@ -37,8 +37,8 @@ def test_lines_tell_the_right_pose_from_others():
     right = odds(exact)
     assert right is not None
     assert right > OPTIONS.gates.verification.odds
-    for turn in (0.1, -0.2):
-        wrong = odds(se3.compose(se3.exp(np.array([[0, 0, 0, 0, turn, 0]])), exact[None])[0])
+    for turn in ([0.1, 0.0, 0.0], [0.0, -0.2, 0.0], [0.0, 0.0, 0.1]):
+        wrong = odds(se3.compose(se3.exp(np.array([[0.0, 0.0, 0.0, *turn]])), exact[None])[0])
         assert wrong is not None
         assert wrong < 0.0
     # Where no line is expected, none that is missing says anything.

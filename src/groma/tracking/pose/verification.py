@@ -3,8 +3,9 @@
 
 A pose needs enough points and lines that agree with it, of enough that were looked at. Fewer will do where the depth of
 the frame confirms it: what the map knows to be somewhere is then measured there. Where few agree and
-depth is known, it must; and a pose that was searched must not look through what the map knows. Where nothing tells what
-the camera sees, after a loss or many missing frames, its place must stand out (:mod:`groma.tracking.pose.rivals`).
+depth is known, it must; and a pose that was searched must not look through what the map knows. Where few points agree
+with it, lines must be seen where they should (:mod:`groma.tracking.pose.expected_lines`). Where nothing tells what the
+camera sees, after a loss or many missing frames, its place must stand out (:mod:`groma.tracking.pose.rivals`).
 """
 
 from __future__ import annotations
@@ -148,7 +149,7 @@ class PoseVerification:
     ) -> Found | None:
         """Find a frame by described features: near the last keyframes first, then anywhere.
 
-        After many frames without a pose, lost or missing, it may be in a place that looks like one of the map.
+        After frames without a pose, lost or missing, it may be in a place that looks like one of the map.
         """
         says_nothing = self._says_nothing(track_map, prior_sigma)
         alone = lost_for > self.gates.lost_frames or ((after_gap or lost_for > 0) and says_nothing)
