@@ -79,6 +79,12 @@ class FindingGates:
     same_turn: float = gate(0.006, "rad", "and this angle", "cost: time to find a pose")
     min_inliers: int = gate(10, "points", "points that agree on a proposal", SEQUENCES)
     max_error: float = gate(4.0, "px", "distance at which they do", SEQUENCES)
+    planes: int = gate(4, "planes", "largest planes of a frame that are laid on planes of the map", "cost: time")
+    crossing: float = gate(0.35, "1", "sine of the angle of two planes that tell a rotation", "convention: 20 degrees")
+    shifts: int = gate(
+        4, "steps", "along two planes, either way, as wide as features are looked for",
+        "derived from the image: to a quarter of it",
+    )  # fmt: skip
     min_trials: int = gate(
         50, "samples", "drawn at least for a proposal", "derived from confidence: one in 10 000 misses a share of 0.55"
     )

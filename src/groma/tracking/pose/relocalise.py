@@ -3,8 +3,9 @@
 
 Used when following fails between two frames, and to find the place again after the track was lost. Where a guess of
 the pose exists, features are matched near where it says they are; otherwise each keyframe proposes a pose from all
-matches, as a photograph is localised. Guesses and proposals are judged by the features and planes that agree
-with them, and the best are estimated from all that agrees: points, lines and planes.
+matches, as a photograph is localised. Where that is not enough, planes of depth images propose poses. Guesses and
+proposals are judged by the features and planes that agree with them, and the best are estimated from all that agrees:
+points, lines and planes.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from groma.tracking.map.planes import assign_planes
 from groma.tracking.map.points import PointTracks
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.pose.estimate import LOSSES, PoseEstimate, estimate_pose, rough_pose
+from groma.tracking.pose.plane_poses import poses_on_planes
 
 
 @dataclass(frozen=True)
@@ -177,7 +179,10 @@ def find_pose(
         # What repeats itself agrees with a wrong guess, too; what no guess suggests may agree with more.
         keyframes = keyframes[:1]
     others = [first(), *(search.proposal(keyframe) for keyframe in keyframes[1:])]
-    return search.best_of([pose for pose in others if pose is not None], gates.finding.max_refined)
+    best = search.best_of([pose for pose in others if pose is not None], gates.finding.max_refined)
+    if not guesses or (best is not None and best.score >= strong):
+        return best
+    return search.best_of(search.on_planes(), gates.finding.max_refined)
 
 
 class _Search:
@@ -227,6 +232,16 @@ class _Search:
         pixel = self.data.features.pixel[second]
         found = pose_from_matches(self.camera, places, pixel, self.gates.min_inliers, self.gates.max_error)
         return found[0] if found is not None else None
+
+    def on_planes(self) -> list[FloatArray]:
+        """Poses at which planes of the frame lie on planes of the keyframes, each where most agrees with it."""
+        seen, planes, known = self.data.planes, self.track_map.planes, self.known
+        if seen is None or not len(known.places):
+            return []
+        index = np.unique(np.concatenate([keyframe.measured.planes.index for keyframe in known.keyframes]))
+        world, centre = planes.hesse[index[planes.alive[index]]], np.median(known.places, axis=0)
+        ways = poses_on_planes(self.camera, seen, world, self.predicted, centre, self.all_gates)
+        return [max(poses, key=self._agreeing) for poses in ways]
 
     def best_of(self, starts: list[FloatArray], most: int) -> Found | None:
         """Refine the starts that most agrees with, unless clearly more does with the best pose; return the best then.
