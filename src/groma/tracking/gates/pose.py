@@ -62,6 +62,12 @@ class FindingGates:
     same_turn: float = gate(0.006, "rad", "and this angle", "cost: time to find a pose")
     min_inliers: int = gate(10, "points", "points that agree on a proposal", SEQUENCES)
     max_error: float = gate(4.0, "px", "distance at which they do", SEQUENCES)
+    planes: int = gate(4, "planes", "largest planes of a frame that are laid on planes of the map", "cost: time")
+    crossing: float = gate(0.35, "1", "sine of the angle of two planes that tell a rotation", "convention: 20 degrees")
+    shifts: int = gate(
+        4, "steps", "along two planes, either way, as wide as features are looked for",
+        "derived from the image: to a quarter of it",
+    )  # fmt: skip
     min_trials: int = gate(
         50, "samples", "drawn at least for a proposal", "derived from confidence: one in 10 000 misses a share of 0.55"
     )
@@ -82,6 +88,7 @@ class VerificationGates:
     min_kept: float = gate(0.12, "share", "share of what the last keyframe measured", SEQUENCES)
     confirmed_evidence: float = gate(6.0, "score", "points and lines where depth confirms a pose", SEQUENCES)
     min_agreeing: float = gate(0.03, "share", "share of the features in view that agree with a found pose", SEQUENCES)
+    odds: float = gate(3.0, "nats", "lines bear out a pose that is more likely by it", "derived from odds of 1 in 20")
     surprise: float = gate(2.0, "sigma", "a pose farther from the prediction is verified again", SEQUENCES)
     wider: float = gate(3.0, "ratio", "the prior of a pose found by features is wider", SEQUENCES)
     jump: float = gate(6.0, "sigma", "distance of a found pose from the prediction", SEQUENCES)

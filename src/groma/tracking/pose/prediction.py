@@ -25,13 +25,16 @@ class MotionModel:
         self._step = 0.0
         self._error = np.full(6, gates.start)
         self._predicted: FloatArray | None = None
+        #: Frames since the last pose: as long as no step is known, each counts for one.
+        self._asked = 0
         #: Whether so many frames had no pose before the last prediction, or were missing, that it is not extrapolated.
         self.after_gap = False
 
     def predict(self, pose: FloatArray, timestamp: float) -> tuple[FloatArray, FloatArray]:
         """Return the pose expected at a time, and the standard deviations (6,) of that expectation."""
         gap = timestamp - self._last_time if self._last_time is not None else 0.0
-        steps = gap / self._step if self._step > 0 else 1.0
+        self._asked += 1
+        steps = gap / self._step if self._step > 0 else float(self._asked)
         self.after_gap = steps > self._gates.max_steps
         gap = min(gap, self._gates.max_steps * self._step) if self._step > 0 else 0.0
         twist = self._velocity * gap
@@ -56,4 +59,4 @@ class MotionModel:
         else:
             self._velocity = np.zeros(6)
             self._error = np.full(6, self._gates.start)
-        self._last_time = timestamp
+        self._last_time, self._asked = timestamp, 0

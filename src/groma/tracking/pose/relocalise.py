@@ -3,8 +3,9 @@
 
 Used when following fails between two frames, and to find the place again after the track was lost. Where a guess of
 the pose exists, features are matched near where it says they are; otherwise each keyframe proposes a pose from all
-matches, as a photograph is localised. Guesses and proposals are judged by the features and planes that agree
-with them, and the best are estimated from all that agrees: points, lines and planes.
+matches, as a photograph is localised. Where that is not enough, planes of depth images propose poses. Guesses and
+proposals are judged by the features and planes that agree with them, and the best are estimated from all that agrees:
+points, lines and planes.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from groma.tracking.map.planes import assign_planes
 from groma.tracking.map.points import PointTracks
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.pose.estimate import LOSSES, PoseEstimate, estimate_pose, rough_pose
+from groma.tracking.pose.plane_poses import poses_on_planes
 
 
 @dataclass(frozen=True)
@@ -179,7 +181,10 @@ def find_pose(
         # What repeats itself agrees with a wrong guess, too; what no guess suggests may agree with more.
         keyframes = keyframes[:1]
     others = [first(), *(search.proposal(keyframe) for keyframe in keyframes[1:])]
-    return search.best_of([pose for pose in others if pose is not None], gates.finding.max_refined)
+    best = search.best_of([pose for pose in others if pose is not None], gates.finding.max_refined)
+    if not guesses or (best is not None and best.score >= strong):
+        return best
+    return search.best_of(search.on_planes(), gates.finding.max_refined)
 
 
 class _Search:
@@ -229,6 +234,16 @@ class _Search:
         pixel = self.data.features.pixel[second]
         found = pose_from_matches(self.camera, places, pixel, self.gates.min_inliers, self.gates.max_error)
         return found[0] if found is not None else None
+
+    def on_planes(self) -> list[FloatArray]:
+        """Poses at which planes of the frame lie on planes of the keyframes, each where most agrees with it."""
+        seen, planes, known = self.data.planes, self.track_map.planes, self.known
+        if seen is None or not len(known.places):
+            return []
+        index = np.unique(np.concatenate([keyframe.measured.planes.index for keyframe in known.keyframes]))
+        world, centre = planes.hesse[index[planes.alive[index]]], np.median(known.places, axis=0)
+        ways = poses_on_planes(self.camera, seen, world, self.predicted, centre, self.all_gates)
+        return [max(poses, key=self._agreeing) for poses in ways]
 
     def best_of(self, starts: list[FloatArray], most: int) -> Found | None:
         """Refine the starts that most agrees with, unless clearly more does with the best pose; return the best then.
@@ -348,13 +363,14 @@ def promote(track_map: TrackMap, found: Found, data: FrameFeatures) -> PointTrac
 
 
 def match_lines(
-    track_map: TrackMap, camera: TrackCamera, data: FrameFeatures, pose: FloatArray, distance: float, angle: float
-) -> tuple[FollowedSegments, LineMeasurements]:
-    """Assign detected segments to lines of the map by where a pose says they are, and how deep."""
+    track_map: TrackMap, camera: TrackCamera, data: FrameFeatures, pose: FloatArray, distance: float, angle: float,
+    among: IntArray | None = None,
+) -> tuple[FollowedSegments, LineMeasurements]:  # fmt: skip
+    """Assign detected segments to lines of the map, or some of them, by where a pose says they are, and how deep."""
     if not data.options.lines:
         return FollowedSegments.empty(), LineMeasurements.empty()
     lines, detected, gates = track_map.lines, data.detected, data.options.gates.lines
-    alive = np.flatnonzero(lines.alive)
+    alive = np.flatnonzero(lines.alive) if among is None else among
     expected, seen = expected_segments(camera, lines, alive, pose, gates)
     alive, expected = alive[seen], expected[seen]
     inverse = 1.0 / np.maximum(into(pose, lines.segment[alive].mean(axis=1))[:, 2], 1e-6)

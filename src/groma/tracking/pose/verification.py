@@ -3,8 +3,9 @@
 
 A pose needs enough points and lines that agree with it, of enough that were looked at. Fewer will do where the depth of
 the frame confirms it: what the map knows to be somewhere is then measured there. Where few agree and
-depth is known, it must; and a pose that was searched must not look through what the map knows. Where nothing tells what
-the camera sees, after a loss or many missing frames, its place must stand out (:mod:`groma.tracking.pose.rivals`).
+depth is known, it must; and a pose that was searched must not look through what the map knows. Where few points agree
+with it, lines must be seen where they should (:mod:`groma.tracking.pose.expected_lines`). Where nothing tells what the
+camera sees, after a loss or many missing frames, its place must stand out (:mod:`groma.tracking.pose.rivals`).
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.options import TrackOptions
 from groma.tracking.pose.depth_check import depth_agreement
 from groma.tracking.pose.estimate import PoseEstimate
+from groma.tracking.pose.expected_lines import line_odds
 from groma.tracking.pose.relocalise import Found, find_pose, match_lines, match_near
 from groma.tracking.pose.rivals import num_cells, stands_out
 
@@ -109,6 +111,16 @@ class PoseVerification:
         _, through = depth_agreement(self.camera, keyframes, data.depth_grid, pose, self.options.gates)
         return through > self.options.gates.depth_check.denies
 
+    def _witnessed(self, track_map: TrackMap, data: FrameFeatures, found: Found) -> bool:
+        """Whether lines, or depth where lines do not tell, bear out a pose that not much agrees with."""
+        if found.score >= self.gates.strong:
+            return True
+        keyframes, estimate = found.known.keyframes, found.estimate
+        odds = line_odds(track_map, self.camera, data, keyframes, estimate.pose)
+        if odds is not None and not 0.0 <= odds < self.gates.odds:
+            return odds > 0.0
+        return not self._contradicted(keyframes, data, estimate)
+
     def _stands_out(self, track_map: TrackMap, data: FrameFeatures, found: Found) -> bool:
         """Whether clearly more points and lines agree with a pose than with others beside it."""
         gates, pixel, camera = self.options.gates, data.features.pixel, self.camera
@@ -139,9 +151,10 @@ class PoseVerification:
     ) -> Found | None:
         """Find a frame by described features: near the last keyframes first, then anywhere.
 
-        After many frames without a pose, lost or missing, it may be in a place that looks like one of the map.
+        After frames without a pose, lost or missing, it may be in a place that looks like one of the map.
         """
-        alone = lost_for > self.gates.lost_frames or (after_gap and self._says_nothing(track_map, prior_sigma))
+        says_nothing = self._says_nothing(track_map, prior_sigma)
+        alone = lost_for > self.gates.lost_frames or ((after_gap or lost_for > 0) and says_nothing)
         if lost_for <= self.gates.lost_frames:
             found = self.find_near(track_map, data, guesses, predicted, prior_sigma, alone, pool)
             if found is not None:
@@ -173,7 +186,7 @@ class PoseVerification:
         # Rooms are alike at both ends, in depth too: of the features in view some must agree.
         if not (found.score >= self.gates.sure or found.share >= self.gates.min_agreeing or not self.options.points):
             return None
-        if alone and not self._stands_out(track_map, data, found):
+        if not self._witnessed(track_map, data, found) or (alone and not self._stands_out(track_map, data, found)):
             return None
         enough = self.evidence(found.estimate) >= self.gates.looser * self._least_evidence
         if enough and found.score >= self.gates.min_score and len(found.estimate.weak) <= 2:
@@ -200,7 +213,9 @@ class PoseVerification:
             return None
         if best.score < self.gates.strong and self._contradicted(best.known.keyframes, data, best.estimate):
             return None
-        if self._denied(data, best) or (alone and not self._stands_out(track_map, data, best)):
+        if self._denied(data, best) or not self._witnessed(track_map, data, best):
+            return None
+        if alone and not self._stands_out(track_map, data, best):
             return None
         return best
 
