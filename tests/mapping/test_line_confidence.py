@@ -20,7 +20,7 @@ from groma.mapping.lines.confidence import (
 )
 from groma.mapping.noise.landmarks import line_noise
 from groma.mapping.options import MapOptions
-from groma.scene import Cameras, LineObservations, Lines, Scene, Similarity
+from groma.scene import Cameras, LineObservations, Lines, Planes, Relations, Scene, Similarity
 
 FOCAL = 500.0
 
@@ -110,6 +110,28 @@ def test_half_of_a_line_decides_though_one_end_is_uncertain():
     expected = erf(gates.tolerance * usual_distance(longer) / (np.sqrt(2.0) * deviation))
     assert line_accuracy(longer, gates=gates)[0] == pytest.approx(expected)
     assert expected < 0.8 * line_accuracy(scene, gates=gates)[0]
+
+
+def test_planes_that_meet_in_a_line_tell_where_it_is():
+    # Seen from a short base its depth is uncertain; the planes x = 0 and z = 10 meet in it.
+    centers = np.column_stack([np.linspace(-0.1, 0.1, 5), np.zeros((5, 2))])
+    gates, scene = replace(GATES, edge_px=1e9), scene_of([[[0.0, -1, 10], [0, 1, 10]]], centers)
+
+    def accuracy(*hesse, **sigma):
+        number = np.arange(len(hesse))
+        on = Relations(line_on_plane=np.column_stack([np.zeros_like(number), number]), **sigma)
+        planes = Planes(number, np.array(hesse, float).reshape(-1, 4))
+        return line_accuracy(scene.replace(planes=planes, relations=on), gates=gates, surface_px=0.5)[0]
+
+    alone, side, depth = accuracy(), [1, 0, 0, 0], [0, 0, 1, -10]
+    nearly = [0.001, 0, np.sqrt(1 - 1e-6), -10]
+    tolerance, flat = gates.tolerance * usual_distance(scene), 0.5 * usual_distance(scene) / FOCAL
+    assert alone < 0.3
+    assert accuracy(depth) == accuracy(depth, nearly) == pytest.approx(alone)
+    assert accuracy(side, depth) == pytest.approx(erf(tolerance / (np.sqrt(2.0) * flat)), rel=1e-3)
+    assert accuracy(side, depth, line_on_plane_sigma=[0.01, 0.02]) == pytest.approx(
+        erf(tolerance / (np.sqrt(2.0) * 0.02))
+    )
 
 
 def test_contours_of_a_pillar_are_no_edges():

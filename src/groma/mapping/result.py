@@ -237,7 +237,7 @@ def result_of(
     """
     scene = with_supported_intervals(adjusted.scene)
     before = before.replace(line_intervals=scene.line_intervals)
-    confidence = line_confidence(before if held else scene)
+    confidence = line_confidence(before if held else scene, weighted.structure_sigma_px)
     scene, kept = scene.replace(lines=scene.lines.replace(confidence=confidence)), confidence >= min_confidence
     scene, before = without_unused(scene.keep(lines=kept), before.keep(lines=kept))
     missing = [] if line_map.num_lines else ["No line was mapped; see what became of the segments."]

@@ -9,9 +9,11 @@ the usual distance of lines from their cameras. Three things must be true of it:
 
 The first factor, that there is an edge at all, is a logistic model of four quantities (:func:`line_evidence`). The
 second is the probability of a normal error within :math:`\tau = 0.0025`, where u is the standard deviation across the
-line that half of its places do not exceed, over the usual distance. The third is the share of normal residuals of r
-pixels root mean square within the width of an edge, a pixel: contours that move with the view and chords of curves fit
-no single line, and where segments of a curve are bowed their standard deviations, and with them r, say so.
+line that half of its places do not exceed, over the usual distance: by its segments, or by the planes that meet in it
+where these tell more, as tread and riser do of the edge of a step that all images see from one height. The third is the
+share of normal residuals of r pixels root mean square within the width of an edge, a pixel: contours that move with the
+view and chords of curves fit no single line, and where segments of a curve are bowed their standard deviations, and
+with them r, say so.
 
 No quantity depends on the unit of length or on how many pixels an image has. The weights were fitted on rendered scenes
 of boxes and round bodies whose edges are known exactly, and the probabilities compared with those of other scenes
@@ -28,6 +30,8 @@ import numpy as np
 import scipy  # its parts are imported when something of them is first used
 
 from groma._typing import BoolArray, FloatArray
+from groma.adjustment.assembly_options import SURFACE_SIGMA_PX
+from groma.adjustment.terms.relations import lengths_per_pixel
 from groma.cameras import model as camera_model
 from groma.execution import begin, map_in_threads
 from groma.features.segments import SEGMENTS
@@ -64,18 +68,24 @@ def with_confidence(scene: Scene) -> Scene:
     return scene.replace(lines=scene.lines.replace(confidence=line_confidence(scene)))
 
 
-def line_confidence(scene: Scene) -> FloatArray:
-    """Return the probability (L,) that each line is right."""
+def line_confidence(scene: Scene, surface_px: float = SURFACE_SIGMA_PX) -> FloatArray:
+    """Return the probability (L,) that each line is right; surfaces deviate from planes by ``surface_px``."""
     noise = line_noise(scene)
-    accuracy = begin(partial(line_accuracy, scene, noise))
+    accuracy = begin(partial(line_accuracy, scene, noise, surface_px=surface_px))
     right = scipy.special.expit(line_evidence(scene, noise) @ np.array(list(WEIGHTS.values())))
     return right * accuracy()
 
 
-def line_accuracy(scene: Scene, noise: LineNoise | None = None, gates: ConfidenceGates = GATES) -> FloatArray:
-    """Return the probability (L,) that each line lies along its edge, given that there is one; ``noise`` if known."""
+def line_accuracy(
+    scene: Scene, noise: LineNoise | None = None, gates: ConfidenceGates = GATES, surface_px: float = SURFACE_SIGMA_PX
+) -> FloatArray:
+    """Return the probability (L,) that each line lies along its edge, given that there is one.
+
+    ``noise`` is that of the lines, if it is known; surfaces deviate from planes by ``surface_px`` pixels.
+    """
     noise = line_noise(scene) if noise is None else noise
-    deviation = _deviation(noise) * np.maximum(noise.misfit, 1.0) / usual_distance(scene)
+    by_segments = _deviation(noise) * np.maximum(noise.misfit, 1.0)
+    deviation = np.minimum(by_segments, _where_planes_meet(scene, surface_px)) / usual_distance(scene)
     within = scipy.special.erf(gates.tolerance / (math.sqrt(2.0) * deviation))
     return within * scipy.special.erf(SEGMENTS.edge / (math.sqrt(2.0) * _residual_px(scene, noise)))
 
@@ -116,6 +126,17 @@ def _residual_px(scene: Scene, noise: LineNoise) -> FloatArray:
     count = np.maximum(np.bincount(line, minlength=scene.num_lines), 1)
     usual = np.exp(np.bincount(line, logs, scene.num_lines) / count)
     return np.maximum(noise.misfit, _MIN_MISFIT) * usual * noise.sigma_px
+
+
+def _where_planes_meet(scene: Scene, surface_px: float) -> FloatArray:
+    """(L,) standard deviation across each line by the planes it lies on alone; very large on one plane or none."""
+    line, plane = scene.relations.line_on_plane.T
+    own, normal = scene.relations.sigma("line_on_plane"), scene.planes.hesse[plane, :3]
+    sigma = np.where(own > 0.0, own, surface_px * lengths_per_pixel(scene, "line")[line])
+    information = np.zeros((scene.num_lines, 3, 3))
+    np.add.at(information, line, normal[:, :, None] * normal[:, None, :] / sigma[:, None, None] ** 2)
+    # Normals are across the line, so the smallest eigenvalue belongs to its direction.
+    return 1.0 / np.sqrt(np.maximum(np.linalg.eigvalsh(information)[:, 1], 1e-300))
 
 
 def _deviation(noise: LineNoise) -> FloatArray:
