@@ -12,6 +12,7 @@ import numba
 import pytest
 
 import groma
+from groma._kernels import cache as kernel_cache
 from groma._kernels.cache import Counts
 from groma.cli.main import run
 from groma.compilation import ahead, needed
@@ -102,6 +103,29 @@ def test_processes_start_once_more_is_missing_than_there(started, monkeypatch, c
     expected(Counts(missed=6, loaded=5))
     expected(Counts(missed=7, loaded=5))
     assert said == ["compiling"] and started == ([("adjust", 3)] if can_fork else [("adjust", 1)] * 3)
+
+
+@pytest.mark.skipif(not ahead.CAN_FORK, reason="processes are not begun before something is missing")
+@pytest.mark.parametrize("is_empty", [True, False])
+def test_processes_begin_at_once_where_nothing_was_ever_compiled(started, monkeypatch, tmp_path, is_empty):
+    monkeypatch.setattr(ahead, "_expected", [])
+    monkeypatch.setattr(kernel_cache, "on_miss", [])
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.delenv("NUMBA_DISABLE_JIT", raising=False)
+    if not is_empty:
+        (tmp_path / "module").mkdir()
+        (tmp_path / "module" / f"function{kernel_cache._SUFFIX}").touch()
+    said = []
+    ahead.begin("map", lambda: said.append("compiling"))
+    assert len(said) == len(started) == is_empty
+    ahead.expect("map", lambda: said.append("compiling"))
+    for missed in (1, 2):
+        kernel_cache.on_miss[0](Counts(missed=missed))
+    assert said == ["compiling"] and started == [("map", 3)]
+    ahead.expect("adjust", lambda: said.append("compiling"))
+    assert [one._work for one in kernel_cache.on_miss] == ["adjust"]
+    ahead.end()
+    assert not kernel_cache.on_miss
 
 
 @pytest.mark.parametrize(("threads", "count"), [(1, 0), (2, 2), (None, 2), (5, 2)])

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Compile what a command needs in processes beside it, while it goes on.
 
-A command says what kind of work it does. Nothing happens until it has to compile: then a process is started, which
-makes the compiler ready and, where the system can, forks until there are as many as cores. They go through the list of
-what such work calls (:mod:`groma.compilation.needed`), in the order in which it is called, and leave out what is there
-or is being compiled (:mod:`groma._kernels.turns`). The command finds the functions on disk when it gets to them, or
-waits for the process that is at it. The processes end with the command.
+A command says what kind of work it does. When it has to compile, or at once if nothing was ever compiled, a process is
+started, which makes the compiler ready and, where the system can, forks until there are as many as cores. They go
+through the list of what such work calls (:mod:`groma.compilation.needed`), in the order in which it is called, and
+leave out what is there or is being compiled (:mod:`groma._kernels.turns`). The command finds the functions on disk when
+it gets to them, or waits for the process that is at it. The processes end with the command.
+
+The compiler is imported where it is needed: a process that gets ready while the command imports it costs no time.
 """
 
 from __future__ import annotations
@@ -18,10 +20,11 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from groma._kernels import cache as kernel_cache
-from groma.compilation.needed import function, imported, needed
+if TYPE_CHECKING:
+    from groma._kernels.cache import Counts
 
 #: How many processes, if the user says so; 0 for none.
 VARIABLE = "GROMA_COMPILE_PROCESSES"
@@ -34,19 +37,22 @@ ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THRE
 
 
 class Ahead:
-    """The processes beside a command; they start when it has missed more functions than it has found."""
+    """The processes beside a command; they start when it has missed more functions than it has found, or are begun."""
 
     def __init__(self, work: str, announce: Callable[[], None], threads: int | None = None) -> None:
         self._work, self._announce, self._threads = work, announce, threads
         self._running: list[subprocess.Popen[bytes]] = []
         self._is_started = False
 
-    def __call__(self, counts: kernel_cache.Counts) -> None:
+    def __call__(self, counts: Counts) -> None:
         """Hear that a function is missing."""
-        if self._is_started or counts.missed <= counts.loaded:
-            return
+        if not self._is_started and counts.missed > counts.loaded:
+            self._announce()
+            self.begin()
+
+    def begin(self) -> None:
+        """Start the processes."""
         self._is_started = True
-        self._announce()
         count = _count(self._threads)
         for _ in range(min(count, 1) if CAN_FORK else count):
             self._start(count if CAN_FORK else 1)
@@ -70,17 +76,43 @@ class Ahead:
         self._running.clear()
 
 
+#: What is expected.
+_expected: list[Ahead] = []
+
+
+def begin(work: str, announce: Callable[[], None], threads: int | None = None) -> None:
+    """Expect some work, and let processes begin with what it needs if nothing was ever compiled."""
+    end()
+    _expected.append(Ahead(work, announce, threads))
+    if CAN_FORK and _is_empty():
+        announce()
+        _expected[0].begin()
+
+
 def expect(work: str, announce: Callable[[], None], threads: int | None = None) -> None:
     """Let processes help with what some work needs, if it comes to that; ``announce`` is called then."""
-    kernel_cache.on_miss[:] = [Ahead(work, announce, threads)]
+    from groma._kernels import cache as kernel_cache
+
+    if [one._work for one in _expected] != [work]:
+        end()
+        _expected.append(Ahead(work, announce, threads))
+    kernel_cache.on_miss[:] = _expected
 
 
 def end() -> None:
     """End the processes; nothing more is expected."""
-    for ahead in kernel_cache.on_miss:
-        if isinstance(ahead, Ahead):
-            ahead.stop()
-    kernel_cache.on_miss.clear()
+    for ahead in _expected:
+        ahead.stop()
+    _expected.clear()
+    if (kernel_cache := sys.modules.get("groma._kernels.cache")) is not None:
+        kernel_cache.on_miss.clear()
+
+
+def _is_empty() -> bool:
+    """Whether no compiled function lies in the first of the places where they are kept, which can be written."""
+    given, is_off = os.environ.get("NUMBA_CACHE_DIR"), os.environ.get("NUMBA_DISABLE_JIT", "0") != "0"
+    place = Path(given) if given else Path(__file__).parents[1]
+    return not is_off and os.access(place, os.W_OK) and next(place.rglob("*.nbc"), None) is None
 
 
 def _count(threads: int | None) -> int:
@@ -93,6 +125,8 @@ def _count(threads: int | None) -> int:
 
 def _end_with_the_command(forked: list[int]) -> None:
     """End at once when the input does, but not in the middle of a file, and after the processes that were forked."""
+    from groma._kernels import cache as kernel_cache
+
     sys.stdin.buffer.read()
     with kernel_cache.writing:
         _wait_for(forked)
@@ -109,6 +143,8 @@ def make_ready(work: str) -> None:
     """Import what some work imports, and what the compiler does at its first use."""
     from numba.core.registry import cpu_target as target
 
+    from groma.compilation.needed import function, imported, needed
+
     cpu_target: Any = target
     if (module_of_work := imported(work)) is not None:
         import_module(module_of_work)
@@ -121,6 +157,8 @@ def make_ready(work: str) -> None:
 def compile_ahead(work: str) -> None:
     """Compile what some work calls, other than what is there or is being compiled."""
     from numba.core.registry import cpu_target
+
+    from groma.compilation.needed import function, imported, needed
 
     if (module_of_work := imported(work)) is not None:
         import_module(module_of_work)

@@ -28,6 +28,7 @@ def demo(
     replace, output = force or output is None, output or Path("groma_demo")
     _output.check_outputs(replace, output)
     _output.check_json(console.json_target, force)
+    console.begin_compilation("map")
 
     from groma.cli.shared.diagnosis import try_diagnosis
     from groma.cli.shared.mapping import run_map, say_map, write_map

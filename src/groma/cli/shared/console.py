@@ -84,6 +84,12 @@ class Console:
         if not self.quiet:  # not wrapped, so that it can be copied
             print(f"Open {(folder / 'report.html').absolute()} in a browser.", file=self._stream, flush=True)
 
+    def begin_compilation(self, work: str) -> None:
+        """Expect compilation, before large imports: processes begin at once if nothing was ever compiled."""
+        from groma.compilation import ahead
+
+        ahead.begin(work, self._announce_compilation, self.threads)
+
     def expect_compilation(self, work: str) -> None:
         """Announce compilation if the work needs any, and let other processes help with it.
 
