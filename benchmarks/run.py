@@ -306,10 +306,10 @@ def main() -> int:
     for problem in PROBLEMS:
         if problem.name not in names:
             continue
+        print(f"{problem.title} (from an empty cache some minutes pass before the first round)", flush=True)
         if not problem.prepare(arguments.data):
             print(f"{problem.title} is left out: {problem.missing(arguments.data)}")
             continue
-        print(problem.title, flush=True)
         result = compete(problem, pythons, rounds)
         if not result["metrics"]:
             print(f"{problem.title}: groma did not finish.")

@@ -179,8 +179,10 @@ class NormalEquations:
                 runs[f] = first, end
         yield from ((f, *run) for f, run in runs.items())
 
-    def cost_of(self, inputs: list[tuple], eliminated: set[int], costs: list[float], hidden: list[int]) -> float:
-        """Return the total cost where only factors of some groups of landmarks have moved; see :meth:`cost`.
+    def cost_of(self, inputs: list[tuple], eliminated: set[int | None], costs: list[float], hidden: list[int]) -> float:
+        """Return the total cost where only factors of some groups of landmarks, or without one, have moved.
+
+        See :meth:`cost`.
 
         ``costs`` and ``hidden`` are those of an earlier evaluation; of all other factors they are taken over.
         """
