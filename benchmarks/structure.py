@@ -180,21 +180,25 @@ def _edge_of_lines(scene: Scene, edges: np.ndarray) -> np.ndarray:
 
 
 def _meeting(scene: Scene, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(M, 2) lines whose edges meet at a corner, and which are seen up to a tenth of their length from there."""
-    first, second = np.triu_indices(len(own), 1)
-    corner = own[first][:, :, None], own[second][:, None, :]
-    gap = np.linalg.norm(corner[0] - corner[1], axis=3).reshape(-1, 4)
-    near = np.flatnonzero(np.nan_to_num(gap, nan=1.0).min(axis=1) < EXACT)
-    first, second, which = first[near], second[near], gap[near].argmin(axis=1)
-    place = own[first, which // 2]
-    ends, seen = scene.lines.segments, np.ones(len(first), bool)
-    for line in (first, second):
-        length = np.linalg.norm(ends[line, 1] - ends[line, 0], axis=1)
-        seen &= np.linalg.norm(ends[line] - place[:, None], axis=2).min(axis=1) < 0.1 * length
+    """(M, 2) lines whose edges meet, and which meet at a corner and are seen up to a tenth of their length from it."""
+    pairs = np.column_stack(np.triu_indices(len(own), 1))
     way = own[:, 1] - own[:, 0]
-    crossed = np.linalg.norm(np.cross(way[first], way[second]), axis=1)
-    kept = crossed > 0.1 * np.linalg.norm(way[first], axis=1) * np.linalg.norm(way[second], axis=1)
-    return np.column_stack([first, second])[kept], seen[kept]
+    length, start = np.linalg.norm(way, axis=1), own[pairs, 0]
+    crossed = np.cross(*way[pairs].swapaxes(0, 1))
+    size, between = np.linalg.norm(crossed, axis=1), start[:, 1] - start[:, 0]
+    kept = size > 0.1 * length[pairs].prod(axis=1)
+    pairs, crossed, size, between = pairs[kept], crossed[kept], size[kept, None], between[kept]
+    away = np.abs(np.einsum("mi,mi->m", between, crossed)) / size[:, 0]
+    other = np.cross(between[:, None], way[pairs][:, ::-1])
+    share = np.einsum("mki,mi->mk", other, crossed) / size**2
+    near = (away < EXACT) & (np.abs(share - 0.5) < 0.5 + EXACT).all(axis=1)
+    pairs, share = pairs[near], share[near]
+    seen = (np.abs(np.abs(share - 0.5) - 0.5) < EXACT).all(axis=1)  # at a corner of both
+    for line, at in zip(pairs.T, share.T, strict=True):
+        ends, place = scene.lines.segments[line], own[line, 0] + at[:, None] * way[line]
+        far = np.linalg.norm(ends - place[:, None], axis=2).min(axis=1)
+        seen &= far < 0.1 * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    return pairs, seen
 
 
 def counts(truth: Truth, scene: Scene) -> dict[str, tuple[int, int, int]]:

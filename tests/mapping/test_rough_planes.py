@@ -116,6 +116,19 @@ def test_heights_of_lines_tell_what_lies_on_a_wall_and_tilts_only_what_crosses_i
     assert np.isin(range(6), lines.pairs[:, 0]).tolist() == [True, True, False, False, False, True]
 
 
+def test_a_point_is_on_one_of_two_faces_and_on_neither_where_it_may_be_on_both():
+    marks, beside = wall(0.0, num_lines=0), 2.0 * SIGMA
+    side = marks.points[:, 0] > 0.0
+    marks.points[side] = np.column_stack([marks.points[side, 2], marks.points[side, 1], marks.points[side, 0]])
+    marks.points[:3], side[:3] = [[-beside, 0.0, 0.0], [0.0, 0.2, beside], [beside / 2.0, 0.4, beside / 2.0]], False
+    faces = pieces_of(marks, [0.0, 0.0], [~side, side])
+    faces.planes[1], faces.covariance[1] = [1.0, 0.0, 0.0, 0.0], faces.covariance[0][np.ix_([2, 1, 0, 3], [2, 1, 0, 3])]
+    points, _ = on_planes(marks, faces, LEVEL, LEAST)
+    # Two deviations from the other face: the likelihoods are as 1 and 7.
+    on = [points.pairs[points.pairs[:, 0] == k, 1].tolist() for k in range(3)]
+    assert on == [[0], [1], []]
+
+
 def test_a_plane_of_few_members_stays():
     marks = wall(0.004)
     cut = found_in(marks, TILT)

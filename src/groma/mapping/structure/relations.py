@@ -133,7 +133,8 @@ def on_planes(
     table = np.concatenate([points, lines])
     mark, owner = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
     is_line = np.arange(len(table)) >= len(points)
-    pixel = np.concatenate([marks.point_pixel[mark[~is_line]], marks.line_pixel[mark[is_line]]])
+    of_point = ~is_line
+    pixel = np.concatenate([marks.point_pixel[mark[of_point]], marks.line_pixel[mark[is_line]]])
     label = _label(found.point_label, marks.point_usable), _label(found.segment_label, marks.line_usable)
     label = np.concatenate(label)[mark + len(marks.points) * is_line]
     half = GATES.layer * found.band
@@ -158,11 +159,23 @@ def on_planes(
         passed = _within(table[rows], deviation * pixel[rows], level) & (told.probability[rows] > enough)
         probability = np.where(inner > 0.0, np.maximum(inner, told.probability[rows]), told.probability[rows])
         pairs = np.column_stack([mark, owner])[rows]
-        chosen = Pairs(pairs, probability, np.where(inner > 0.0, 0.0, deviation)).take(passed | (inner > 0.0))
-        return _best_of_competing(chosen, competing, num)
+        chosen = Pairs(pairs, probability, np.where(inner > 0.0, 0.0, deviation))
+        likely = np.flatnonzero(passed | (inner > 0.0))
+        likely = likely[_best_of_competing(chosen.take(likely), competing, num)]
+        if rows is is_line:
+            return chosen.take(likely)
+        return _on_one_face(chosen.take(likely), table[rows][likely], pixel[rows][likely], enough)
 
-    points_on, lines_on = together(partial(related, ~is_line, least[0]), partial(related, is_line, least[1]))
+    points_on, lines_on = together(partial(related, of_point, least[0]), partial(related, is_line, least[1]))
     return points_on, lines_on
+
+
+def _on_one_face(found: Pairs, table: FloatArray, pixel: FloatArray, least: float) -> Pairs:
+    """The pairs that are sure, too, if a point is on one face alone; beside an edge both have as many points."""
+    mark, variance = found.pairs[:, 0], table[:, 3] ** 2 + (found.deviation * pixel) ** 2
+    density = np.exp(-0.5 * table[:, 2] ** 2 / variance) / np.sqrt(variance)
+    own = density / np.maximum(np.bincount(mark, density), np.finfo(float).tiny)[mark]
+    return Pairs(found.pairs, found.probability * own, found.deviation).take(found.probability * own > least)
 
 
 def _on_plane_itself(table: FloatArray, band: FloatArray, level: float, least: float) -> FloatArray:
@@ -305,11 +318,11 @@ def _near_segments(points: FloatArray, segments: FloatArray) -> IntArray:
     return distinct_pairs(np.repeat(np.arange(len(points)), number), owner[index].ravel())[0]
 
 
-def _best_of_competing(found: Pairs, competing: BoolArray, num: int) -> Pairs:
-    """The likeliest pairs where a landmark is claimed by structures of which only one can be right."""
+def _best_of_competing(found: Pairs, competing: BoolArray, num: int) -> BoolArray:
+    """Which pairs (M,) are the likeliest where a landmark is claimed by structures of which only one can be right."""
     pairs = found.pairs
     if len(pairs) == 0:
-        return found
+        return np.zeros(0, bool)
     order = np.lexsort((-found.probability, pairs[:, 0]))
     kept = np.zeros(len(pairs), dtype=bool)
     # Claims of one landmark follow each other, the likeliest first: compare rank by rank with those kept before.
@@ -323,4 +336,4 @@ def _best_of_competing(found: Pairs, competing: BoolArray, num: int) -> Pairs:
         free = ~(taken[owner] & competing[structure]).any(axis=1)
         kept[rows[free]] = True
         taken[owner[free], structure[free]] = True
-    return found.take(kept)
+    return kept
