@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from worlds import CAMERA, make_world, project
 
-from groma.features.segments import Segments
+from groma.features.matching.wide_baseline import WideBaselineOptions
+from groma.features.segments import SEGMENTS, Segments
 from groma.localization.features import DescribedPoints, unit
 from groma.localization.landmarks import GATES, DescribedLandmarks, coarsest, counted_in, seen_in
-from groma.localization.line_matching import GATES as LINES
 from groma.localization.line_matching import SeenLines, lines_near
 from groma.localization.map_index import MapIndex
 from groma.localization.matching import MATCHES, alike_elsewhere, lengths_of, match_descriptors, pairs_near
@@ -91,9 +91,9 @@ def test_lines_near_where_they_are_expected():
         for k, pair in enumerate(segments.ends.reshape(-1, 2, 2)):
             place, across, way = (pair - start) @ along, (pair - start) @ normal, np.linalg.norm(pair[1] - pair[0])
             common = min(place.max(), length) - max(place.min(), 0.0)
-            near = np.abs(across).max() <= 8.0 and abs(across[1] - across[0]) <= LINES.angle * way
+            near = np.abs(across).max() <= 8.0 and abs(across[1] - across[0]) <= SEGMENTS.angle * way
             alike = min(np.linalg.norm(described[j] - own[k]) for j in np.flatnonzero(owner == i))
-            if near and common >= LINES.overlap * way and alike <= LINES.descriptor:
+            if near and common >= SEGMENTS.overlap * way and alike <= WideBaselineOptions.max_descriptor_distance:
                 expected.add((i, k))
     assert set(map(tuple, found.tolist())) == expected
     assert 20 < len(expected) <= 100

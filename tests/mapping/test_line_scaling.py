@@ -9,8 +9,8 @@ import pytest
 from _comparison import equal
 
 from groma.cli.commands.map import map_
+from groma.features.segments import SEGMENTS
 from groma.mapping.groups import distinct_pairs, num_distinct
-from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.line_map import LineMap, explain
 from groma.mapping.lines.linking import merge as _line_merge
 from groma.mapping.lines.linking.merge import MergeGates
@@ -40,7 +40,7 @@ def all_pairs(X, reach):
                 continue
             t = (X[b] - X[a, 0]) @ d / (d @ d)
             low, high = max(0.0, t.min()), min(1.0, t.max())
-            if high - low < AGREEMENT.min_overlap * min(1.0, np.ptp(t)):
+            if high - low < SEGMENTS.overlap * min(1.0, np.ptp(t)):
                 continue
             places = np.array([low, high])
             on_b = X[b, 0] + ((places - t[0]) / (t[1] - t[0]))[:, None] * e

@@ -7,6 +7,7 @@ import _room
 import numpy as np
 import pytest
 
+from groma.gates import NORMAL
 from groma.geometry import se3
 from groma.tracking import Tracker, TrackOptions
 from groma.tracking.backend.depth_calibration import correct_depths, depths_that_do_not_fit
@@ -51,7 +52,7 @@ def test_right_depths_stay(frames):
     assert not any("disagree" in sentence for sentence in result.warnings)
 
 
-def test_depths_that_do_not_fit_the_points_are_told(frames):
+def test_depths_that_do_not_fit_the_points_are_told(frames, monkeypatch):
     """Depths of a finished map are put off, to both sides in turn, by half of their noise and by three times that."""
     track_map = _tracked(frames[:16], 0.0)[0].map
     gates = TrackOptions().gates.depth
@@ -64,8 +65,8 @@ def test_depths_that_do_not_fit_the_points_are_told(frames):
             away = sigmas * points.depth_sigma * np.where(np.arange(len(points)) % 2, 1.0, -1.0)
             keyframe.measured = replace(keyframe.measured, points=replace(points, depth=points.depth + away))
         assert len(depths_that_do_not_fit(off, gates)) == told
-    few = replace(gates, min_depths=10**6)
-    assert depths_that_do_not_fit(off, few) == []
+    monkeypatch.setattr("groma.tracking.backend.depth_calibration.NORMAL", replace(NORMAL, sample=10**6))
+    assert depths_that_do_not_fit(off, gates) == []
 
 
 def test_an_offset_beyond_all_noise_is_told_and_not_used(frames):

@@ -23,20 +23,9 @@ from enum import IntEnum
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.gates import gate
 from groma.geometry import incidence, line3, projection
 from groma.geometry.algebra import cofactor, dot, matrices, norm, not_negative, ratio, stack, unit, vectors
-
-
-@dataclass(frozen=True)
-class TrimGates:
-    """Ends of lines."""
-
-    min_sine: float = gate(0.02, "1", "of the angle of line and ray", "derived from noise: 50 times as large")
-
-
-#: The defaults.
-TRIMS = TrimGates()
+from groma.geometry.incidence import MIN_SINE
 
 
 class TrimStatus(IntEnum):
@@ -67,7 +56,7 @@ class TrimmedPoints:
 
 
 def trim_to_ray(
-    line: FloatArray, ray_origin: FloatArray, ray_direction: FloatArray, min_sine: float = TRIMS.min_sine
+    line: FloatArray, ray_origin: FloatArray, ray_direction: FloatArray, min_sine: float = MIN_SINE
 ) -> TrimmedPoints:
     r"""Point of lines closest to viewing rays.
 
@@ -113,11 +102,7 @@ def trim_to_ray(
 
 
 def trim_in_image(
-    camera: FloatArray,
-    line: FloatArray,
-    pixel: FloatArray,
-    min_sine: float = TRIMS.min_sine,
-    min_distance: float = 1e-9,
+    camera: FloatArray, line: FloatArray, pixel: FloatArray, min_sine: float = MIN_SINE, min_distance: float = 1e-9
 ) -> TrimmedPoints:
     r"""Point of lines whose image is the foot of a pixel on the projected line.
 
@@ -178,7 +163,7 @@ def trim_in_image(
 
 
 def trim_segments(
-    camera: FloatArray, line: FloatArray, segment: FloatArray, min_sine: float = TRIMS.min_sine
+    camera: FloatArray, line: FloatArray, segment: FloatArray, min_sine: float = MIN_SINE
 ) -> TrimmedPoints:
     """Both end points of image segments (..., 4) on lines (..., 6), in the image.
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from groma._typing import FloatArray
 from groma.errors import InputError, ShapeError
-from groma.evaluation.gates import ALIGNMENT
+from groma.evaluation.gates import SCORES
 from groma.geometry import quaternion, so3
 from groma.geometry.algebra import finite_rows
 from groma.scene import Similarity
@@ -137,7 +137,7 @@ def pose_alignment(source: npt.ArrayLike, target: npt.ArrayLike, with_scale: boo
     noise = np.sqrt(np.sum((y - by_centers.points(x)) ** 2) / (3 * len(x) - (7 if with_scale else 6)))
     lever = by_centers.scale * np.sqrt(np.linalg.eigvalsh(np.sum(x0**2) * np.eye(3) - x0.T @ x0)[0])
     scatter = np.sqrt(np.sum((votes - mean) ** 2) / 2 / (3 * len(x) - 3))
-    if noise <= lever * max(scatter, ALIGNMENT.known_rotation):
+    if noise <= lever * max(scatter, SCORES.known_rotation):
         return PoseAlignment(by_centers, False)
     # Orientations that agree to rounding are as good as those that agree to a part in a million.
     weight = 2 * len(x) * by_centers.scale * max(scatter, 1e-6) ** 2 / noise**2

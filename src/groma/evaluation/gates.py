@@ -32,15 +32,9 @@ class ScoreGates:
     segment_lengths: tuple[float, ...] = gate(
         (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0), "m", "lengths of the segments of a drift", _KITTI
     )
+    known_rotation: float = gate(math.radians(1.0), "rad", "of rotations known from centres", "convention: a degree")
     segment_step: int = gate(10, "poses", "step between their first poses", _KITTI)
 
 
-@dataclass(frozen=True)
-class AlignmentGates:
-    """When camera centres determine a rotation."""
-
-    known_rotation: float = gate(math.radians(1.0), "rad", "of rotations known from centres", "convention: one degree")
-
-
 #: The numbers in use.
-SCORES, ALIGNMENT = ScoreGates(), AlignmentGates()
+SCORES = ScoreGates()

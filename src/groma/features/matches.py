@@ -10,18 +10,6 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.features.segments import SEGMENTS, Segments
-from groma.gates import gate
-
-
-@dataclass(frozen=True)
-class RivalGates:
-    """Candidates that continue the line of the best one are no rivals of it."""
-
-    angle: float = gate(0.02, "rad", "and angle", "derived from a pixel at the ends of a segment")
-
-
-#: The numbers in use.
-RIVALS = RivalGates()
 
 
 @dataclass(frozen=True)
@@ -121,7 +109,7 @@ def _best_and_rival(
         np.abs((line[:, :2] * ends[:, :2]).sum(axis=1) + line[:, 2]),
         np.abs((line[:, :2] * ends[:, 2:]).sum(axis=1) + line[:, 2]),
     )
-    is_rival = (other != chosen) & (distance > SEGMENTS.on + RIVALS.angle * segments.length[other])
+    is_rival = (other != chosen) & (distance > SEGMENTS.on + SEGMENTS.collinear * segments.length[other])
     rival = np.full(len(best), -np.inf)
     np.maximum.at(rival, owner[is_rival], evidence[is_rival])
     return best, rival

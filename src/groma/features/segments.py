@@ -30,6 +30,7 @@ class SegmentGates:
     edge: float = gate(1.0, "px", "from each other, within which segments are one edge", "derived from a sharp lens")
     on: float = gate(2.0, "px", "from a segment, within which a place or another segment is on it", LINE_MAPS)
     angle: float = gate(0.1, "rad", "between a segment and the image of its line", "derived from short segments")
+    collinear: float = gate(0.02, "rad", "between pieces of one edge", "derived from a pixel at the ends of a segment")
     overlap: float = gate(0.3, "share", "of the shorter of two segments, that the other covers", LINE_MAPS)
 
 

@@ -3,32 +3,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from groma._counted import counted
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.adjustment.misfit.lens import LENS
 from groma.cameras import model as camera_model
 from groma.errors import ProblemError
-from groma.gates import gate
 from groma.scene import Scene
-
-
-@dataclass(frozen=True)
-class CalibrationGates:
-    """When measured pixels show that a camera's image size is that of other images."""
-
-    share_outside: float = gate(
-        0.5,
-        "share",
-        "of a camera's observations outside its image",
-        "derived from pixels spread evenly: of images twice as wide and high three quarters are outside; models that "
-        "were undistorted and cropped keep a few there",
-    )
-
-
-CALIBRATION = CalibrationGates()
 
 
 def refuse_focal_lengths(scene: Scene) -> None:
@@ -65,7 +47,7 @@ def doubtful_cameras(scene: Scene) -> tuple[str, ...]:
             "be checked. Give the cameras their width and height."
         )
     share_outside = _share_outside(scene)
-    if len(strange := np.flatnonzero(used & sized & (share_outside > CALIBRATION.share_outside))):
+    if len(strange := np.flatnonzero(used & sized & (share_outside > LENS.share_outside))):
         first, share = strange[0], share_outside[strange[0]]
         said.append(
             f"{_named(scene, strange)}: {100 * share:.0f} % of the observations are outside the image of "

@@ -27,9 +27,9 @@ from functools import partial
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.adjustment.misfit.lens import LENS
 from groma.execution import map_in_threads
 from groma.factors.contract import Factor
-from groma.gates import gate
 from groma.problem.problem import Problem
 from groma.problem.residuals import jacobians_of, residuals_of, root_matrices
 from groma.solver.covariance.marginals import Covariances
@@ -40,16 +40,6 @@ _LANDMARKS, _STRUCTURE = ("points", "lines"), ("planes", "directions")
 #: Numbers in the largest arrays of one batch of landmarks, and batches that are worked on before they are added
 #: (cost: memory).
 _BATCH, _AT_ONCE = 300_000, 16
-
-
-@dataclass(frozen=True)
-class JackknifeGates:
-    """What is believed of single landmarks."""
-
-    max_leverage: float = gate(0.9, "share", "of an error that cameras follow", "derived from errors ten times larger")
-
-
-GATES = JackknifeGates()
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,10 +207,10 @@ def _pull(rows: _Rows, stated: FloatArray, taken: IntArray) -> FloatArray:
 
 def _without_own(leverage: FloatArray, residual: FloatArray) -> FloatArray:
     """Residuals (B, R, 1) as they would be without what the cameras follow them; leverage (B, R, R)."""
-    bold = np.trace(leverage, axis1=1, axis2=2) > GATES.max_leverage  # no share of the others exceeds it
+    bold = np.trace(leverage, axis1=1, axis2=2) > LENS.max_leverage  # no share of the others exceeds it
     error = np.linalg.solve(np.eye(leverage.shape[1]) - np.where(bold[:, None, None], 0.0, leverage), residual)
     if bold.any():
         shares, axes = np.linalg.eigh(leverage[bold])
         along = np.swapaxes(axes, 1, 2) @ residual[bold]
-        error[bold] = axes @ (along / (1.0 - np.minimum(shares, GATES.max_leverage))[:, :, None])
+        error[bold] = axes @ (along / (1.0 - np.minimum(shares, LENS.max_leverage))[:, :, None])
     return np.asarray(error, np.float64)

@@ -45,12 +45,19 @@ WIDER: dict[str, str] = dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADI
 
 @dataclass(frozen=True)
 class LensGates:
-    """When residuals show a lens."""
+    """When residuals show another lens, rig or calibration."""
 
     false_alarm: float = gate(1e-6, "probability", "of rings of residuals that are noise", "convention: five sigma")
     share: float = gate(0.1, "share", "of the residuals' variance that calls for a warning", "convention: a tenth")
     rings: int = gate(16, "rings", "of equal area around the principal point", "convention: as many as a histogram has")
     max_observations: int = gate(200_000, "observations", "that judge a lens or a rig", "cost: more tell no more")
+    rig_iterations: int = gate(10, "steps", "with free cameras", "cost: most need three")
+    max_leverage: float = gate(0.9, "share", "of an error that cameras follow", "derived from errors ten times larger")
+    share_outside: float = gate(
+        0.5, "share", "of a camera's observations outside its image",
+        "derived from pixels spread evenly: of images twice as wide and high three quarters are outside; models that "
+        "were undistorted and cropped keep a few there",
+    )  # fmt: skip
     max_iterations: int = gate(4, "steps", "with free distortion", "cost: the first brings most")
 
 

@@ -11,7 +11,7 @@ the images of a frame were taken at different times.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,7 +21,6 @@ from groma.adjustment.stages import with_loss
 from groma.factors.contract import Factor, Ref
 from groma.factors.losses import Cauchy
 from groma.factors.observations.point_reprojection import PointReprojection
-from groma.gates import gate
 from groma.geometry import quaternion, se3
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
@@ -31,16 +30,6 @@ from groma.solver.solve import solve
 
 #: The group of the places of cameras on their rigs, and that of places of single images.
 SENSORS, ALONE = "sensors", "sensors, each image alone"
-
-
-@dataclass(frozen=True)
-class RigGates:
-    """When residuals show that a rig does not fit."""
-
-    max_iterations: int = gate(10, "steps", "with free cameras", "cost: most need three")
-
-
-GATES = RigGates()
 
 
 def rig_that_does_not_fit(scene: Scene, problem: Problem, threads: int | None = None) -> str | None:
@@ -57,7 +46,7 @@ def rig_that_does_not_fit(scene: Scene, problem: Problem, threads: int | None = 
     if not on_rigs or SENSORS not in problem.variables:
         return None
     options, reference = (
-        SolverOptions(max_iterations=GATES.max_iterations, threads=threads),
+        SolverOptions(max_iterations=LENS.rig_iterations, threads=threads),
         scene.sensors.is_reference == 1,
     )
     begun = with_loss(of_points(problem, LENS.max_observations), Cauchy(1.0))

@@ -9,8 +9,6 @@ cameras are on the side of its normal.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from groma._typing import FloatArray
@@ -18,21 +16,12 @@ from groma.adjustment.survey.similarity import GATES as SIMILARITY
 from groma.adjustment.survey.similarity import turn_between
 from groma.adjustment.survey.triangulate import triangulated
 from groma.errors import InputError
-from groma.gates import NORMAL, gate
+from groma.gates import NORMAL
 from groma.geometry import quaternion
 from groma.geometry.algebra import unit
 from groma.scene import Scene, Similarity
 from groma.scene.survey import Kind
 
-
-@dataclass(frozen=True)
-class LevelGates:
-    """When directions measured in cameras fit the scene."""
-
-    apart_deg: float = gate(10.0, "degrees", "by which directions differ if axes are doubted", "cost: a refused phone")
-
-
-GATES = LevelGates()
 #: Axes that files have by mistake, and messages about them.
 _OTHER_AXES = {
     "the axes of OpenGL (y up, looking along -z)": np.diag([1.0, -1.0, -1.0]),
@@ -154,7 +143,7 @@ def _check_axes(
 ) -> None:
     """Refuse directions in cameras that contradict each other at the poses of the scene, turned freely or as given."""
     noise = float(np.degrees(np.median(scene.known_directions.sigma[rows])))
-    if apart <= max(GATES.apart_deg, NORMAL.far * noise):
+    if apart <= max(SIMILARITY.apart_deg, NORMAL.far * noise):
         return
     angles = {}
     for words, axes in _OTHER_AXES.items():

@@ -23,9 +23,10 @@ from groma.adjustment.fit import noise_of
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.adjustment.survey.given import Survey
 from groma.adjustment.survey.names import nearest
+from groma.adjustment.survey.similarity import GATES as SIMILARITY
 from groma.adjustment.terms.objects import GROUPS
 from groma.errors import InputError
-from groma.gates import NORMAL, gate
+from groma.gates import NORMAL
 from groma.geometry import quaternion
 from groma.geometry.algebra import unit
 from groma.io.survey import DirectionsFile, DistancesFile, PlanesFile, PosesFile
@@ -43,16 +44,6 @@ from groma.scene.survey import DIRECTED, LOCATED, UNKNOWN, Kind
 
 _LANDMARK = re.compile(r"(point|line|plane|direction):(\d+)")
 _KINDS = {"point": Kind.POINT, "line": Kind.LINE, "plane": Kind.PLANE, "direction": Kind.DIRECTION}
-
-
-@dataclass(frozen=True)
-class ObjectGates:
-    """Messages about measured objects."""
-
-    parallel_deg: float = gate(10.0, "degrees", "from parallel, where lines have no width", "cost: a meaning")
-
-
-GATES = ObjectGates()
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +150,7 @@ def distance_table(scene: Scene, given: DistancesFile, stated: float | None, not
         raise InputError(f"{given.source}: {given.first[row]} and {given.second[row]} are the same. Drop that line.")
     is_shortest = np.zeros(len(first.kind), bool)
     for row, ends in enumerate(zip(first.kind, first.idx, second.kind, second.idx, strict=True)):
-        if (apart := _from_parallel(scene, *ends)) > GATES.parallel_deg:
+        if (apart := _from_parallel(scene, *ends)) > SIMILARITY.parallel_deg:
             words = f"{given.first[row]} and {given.second[row]} are {apart:.0f} degrees from parallel"
             if Kind.PLANE in (ends[0], ends[2]):
                 raise InputError(f"{given.source}: {words}: they meet, so they have no distance. Measure from a mark.")

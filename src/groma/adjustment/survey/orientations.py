@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.adjustment.survey.level import GATES
 from groma.adjustment.survey.similarity import GATES as SIMILARITY
 from groma.errors import InputError
 from groma.gates import NORMAL
@@ -47,7 +46,7 @@ def check_orientations(scene: Scene, rotation: FloatArray | None) -> None:
     given = quaternion.conjugate(table.cam_from_world[:, :4])
     apart = _apart(given, own, rotation)
     noise = np.degrees(np.sqrt(np.median(np.einsum("nii->ni", table.covariance)[:, 3:])))
-    if apart <= max(GATES.apart_deg, NORMAL.far * noise):
+    if apart <= max(SIMILARITY.apart_deg, NORMAL.far * noise):
         return
     back, wxyz = quaternion.conjugate(given), given[:, [1, 2, 3, 0]]
     others = {

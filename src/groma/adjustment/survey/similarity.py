@@ -27,9 +27,12 @@ from groma.scene import Scene, Similarity
 
 @dataclass(frozen=True)
 class SimilarityGates:
-    """How a similarity to measurements is found."""
+    """How a similarity to measurements is found, and what is said where none is."""
 
     draws: int = gate(500, "triples", "of correspondences tried", "derived from 1e-7 without a good one, 70 % inliers")
+    apart_deg: float = gate(10.0, "degrees", "by which directions differ if axes are doubted", "cost: a refused phone")
+    parallel_deg: float = gate(10.0, "degrees", "from parallel, where lines have no width", "cost: a meaning")
+    near_unit: float = gate(0.05, "share", "by which lengths may miss a factor of two units", "cost: a wrong hint")
     better: float = gate(3.0, "times", "a fit must get with other axes, to name them", "chosen on random point sets")
 
 

@@ -7,25 +7,13 @@ ratio of common units: then it is not noise.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from groma._typing import FloatArray
 from groma.adjustment.survey.similarity import GATES as SIMILARITY
 from groma.adjustment.survey.similarity import RobustSimilarity, robust_similarity
 from groma.errors import InputError
-from groma.gates import gate
 
-
-@dataclass(frozen=True)
-class UnitGates:
-    """When a factor is that of two units."""
-
-    near: float = gate(0.05, "share", "by which lengths may miss the factor of two units", "cost: a wrong sentence")
-
-
-GATES = UnitGates()
 #: Lengths in metres.
 _UNITS = {"feet": 0.3048, "millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "kilometres": 1e3}
 
@@ -33,9 +21,9 @@ _UNITS = {"feet": 0.3048, "millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.
 def unit_words(ratio: float) -> tuple[str, str] | None:
     """Return two units of length with this ratio; None if there are none."""
     for name, metres in _UNITS.items():
-        if abs(ratio * metres - 1.0) < GATES.near:
+        if abs(ratio * metres - 1.0) < SIMILARITY.near_unit:
             return name, "metres"
-        if abs(ratio / metres - 1.0) < GATES.near:
+        if abs(ratio / metres - 1.0) < SIMILARITY.near_unit:
             return "metres", name
     return None
 

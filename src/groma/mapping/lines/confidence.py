@@ -52,6 +52,7 @@ class ConfidenceGates:
     """What a line must be within to be right."""
 
     tolerance: float = gate(0.0025, "1", "error of a right line over the distance", "convention: two pixels")
+    edge_px: float = gate(SEGMENTS.edge, "px", "residual of a segment of a right line", "derived from an edge's width")
 
 
 GATES = ConfidenceGates()
@@ -87,7 +88,7 @@ def line_accuracy(
     by_segments = _deviation(noise) * np.maximum(noise.misfit, 1.0)
     deviation = np.minimum(by_segments, _where_planes_meet(scene, surface_px)) / usual_distance(scene)
     within = scipy.special.erf(gates.tolerance / (math.sqrt(2.0) * deviation))
-    return within * scipy.special.erf(SEGMENTS.edge / (math.sqrt(2.0) * _residual_px(scene, noise)))
+    return within * scipy.special.erf(gates.edge_px / (math.sqrt(2.0) * _residual_px(scene, noise)))
 
 
 def line_evidence(scene: Scene, noise: LineNoise | None = None) -> FloatArray:

@@ -17,6 +17,9 @@ class AgreementGates:
     )
     min_common: float = gate(0.6, "share", "of the images of a line, that another explains", LINE_MAPS)
 
+    min_ratio: float = gate(2.0, "1", "images of a line that only runs near another, over its own", LINE_MAPS)
+    depth: float = gate(0.01, "1", "relative difference of inverse depths of a point and a segment", LINE_MAPS)
+
     def max_squared(self, dof: int) -> float:
         """Largest squared Mahalanobis distance of two that agree."""
         return chi_square_gate(self.outlier_probability, dof)

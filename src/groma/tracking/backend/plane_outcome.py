@@ -10,7 +10,6 @@ import numpy as np
 from groma._counted import counted
 from groma.adjustment.assemble import assemble
 from groma.adjustment.relation_outcome import drop_failed_relations
-from groma.estimators.plane_search import PlaneOptions
 from groma.gates import NORMAL
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.gates import DEFAULT, LandmarkPlaneGates
@@ -74,7 +73,7 @@ def drop_what_failed(
         failed = np.setdiff1d(rows, held)
         table.plane[failed], dropped = -1, dropped + len(failed)
         support += weight * np.bincount(table.plane[np.intersect1d(rows, held)], minlength=len(own))
-    gone = np.flatnonzero(own & (support < np.maximum(PlaneOptions.min_support, NORMAL.majority * before)))
+    gone = np.flatnonzero(own & (support < np.maximum(gates.min_support, NORMAL.majority * before)))
     forget(track_map, gone)
     track_map.planes.support[own] = support[own]
     return dropped, len(gone)

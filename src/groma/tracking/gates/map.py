@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from groma.estimators.plane_search import PlaneOptions
 from groma.gates import SEQUENCES, gate
 
 
@@ -84,6 +85,7 @@ class LandmarkPlaneGates:
     surface_sigmas_px: tuple[float, ...] = gate(
         (0.2, 0.8, 3.2), "px", "deviations of surfaces that are tried", "derived from photographs, x 1, 4, 16"
     )
+    min_support: int = gate(PlaneOptions.min_support, "points", "on a plane (a line: 2)", "derived from the search")
     min_views: int = gate(2, "images", "that see a landmark (a pair is two); it was followed between them", SEQUENCES)
 
 

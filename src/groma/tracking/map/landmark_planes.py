@@ -18,7 +18,6 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.terms.relations import lengths_per_pixel
-from groma.estimators.plane_search import PlaneOptions
 from groma.gates import NORMAL
 from groma.mapping.structure.find import StructureOptions, detect_structure
 from groma.mapping.structure.flatness import plane_noise_px
@@ -98,7 +97,7 @@ def _chosen(scene: Scene, gates: LandmarkPlaneGates) -> list[_Claim]:
     for claim in sorted(claims, key=lambda claim: claim.false_alarms):
         left = replace(claim, points=claim.points[free_point[claim.points]], lines=claim.lines[free_line[claim.lines]])
         kept = replace(left, points=left.points[again[left.points]])
-        if left.support < NORMAL.majority * claim.support or kept.support < PlaneOptions.min_support:
+        if left.support < NORMAL.majority * claim.support or kept.support < gates.min_support:
             continue
         chosen.append(kept)
         # Nothing else lies in its layer: relief so near cannot be distinguished from the plane.

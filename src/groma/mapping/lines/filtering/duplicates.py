@@ -10,33 +10,20 @@ unexplained.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from groma._typing import BoolArray, IntArray
 from groma.features.segments import SEGMENTS
-from groma.gates import LINE_MAPS, gate
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.linking.growth import near_lines, votes_for_same
 from groma.mapping.lines.linking.merge import seen_apart
 from groma.mapping.lines.linking.tracks import Tracks
 
 
-@dataclass(frozen=True)
-class DuplicateGates:
-    """When a line is explained by another one."""
-
-    min_ratio: float = gate(2.0, "1", "images of a line that only runs near, over its own", LINE_MAPS)
-
-
-GATES = DuplicateGates()
-
-
 def not_duplicates(tracks: Tracks, neighbors: list[IntArray], min_images: int) -> BoolArray:
     """(L,) lines that no other line explains."""
     good, images = np.ones(tracks.num_lines, bool), tracks.num_images()
-    for reach, ratio in ((SEGMENTS.edge, GATES.min_ratio), (None, 1.0)):
+    for reach, ratio in ((SEGMENTS.edge, AGREEMENT.min_ratio), (None, 1.0)):
         hit = near_lines(tracks, neighbors, reach)
         owner = tracks.line_of[hit[:, 1]]
         stronger = (owner >= 0) & (images[hit[:, 0]] > images[owner]) & (images[hit[:, 0]] >= ratio * images[owner])

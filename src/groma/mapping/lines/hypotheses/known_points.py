@@ -9,28 +9,17 @@ at the two ends is known from a vanishing point, :math:`q(t) = q_1 (1 + (r - 1) 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray, IntArray
 from groma.features.segments import SEGMENTS
-from groma.gates import LINE_MAPS, gate
+from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.views import LineViews
 
 #: Points of one segment that are looked at (cost: time).
 _MAX_POINTS = 16
-
-
-@dataclass(frozen=True)
-class KnownPointGates:
-    """Which points lie on a segment, and agree."""
-
-    tolerance: float = gate(0.01, "1", "relative difference of inverse depths", LINE_MAPS)
-
-
-GATES = KnownPointGates()
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -149,8 +138,6 @@ def lines_through_points(
         Pixels and inverse depths of the points.
     slot : int
         What stands for points in the place of a neighbour; the next number stands for a point and a direction.
-    gates : KnownPointGates, optional
-        Which points lie on a segment.
 
     Returns
     -------
@@ -161,6 +148,6 @@ def lines_through_points(
     index, values = np.empty((2 * len(ratios), 3), np.int64), np.empty((2 * len(ratios), 6))
     count = _propose(
         views.ends[rows], views.line[rows], views.usable[rows], views.range[rows], ratios, *points, SEGMENTS.on,
-        GATES.tolerance, SEGMENTS.overlap, slot, index, values,
+        AGREEMENT.depth, SEGMENTS.overlap, slot, index, values,
     )  # fmt: skip
     return index[:count], values[:count]
