@@ -109,7 +109,7 @@ def test_the_largest_of_several_models_is_read(true, tmp_path):
     whole = nvm(true, 0.0).split("\n")
     small = ["1", f"lone.jpg\t{FOCAL} 1 0 0 0 0 0 0 0 0", "0", ""]
     (tmp_path / "a.nvm").write_text("\n".join([whole[0], *small, *whole[1:]]))
-    with pytest.warns(UserWarning, match=r"2 reconstructions .* \(4\) is read, the others \(1 images\) are not"):
+    with pytest.warns(UserWarning, match=r"2 reconstructions .* \(4\) is read, the other \(1 image\) is not"):
         assert read_scene(tmp_path / "a.nvm").images.names == tuple(NAMES)
 
 

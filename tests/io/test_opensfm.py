@@ -153,7 +153,7 @@ def test_of_several_reconstructions_the_largest_is_the_scene(true, tmp_path):
         del part["shots"][name]
     whole["reference_lla"] = {"latitude": 52.5, "longitude": 13.4, "altitude": 30.0}
     path = write(tmp_path, [part, whole], tracks(true, "perspective", said, 2))
-    with pytest.warns(UserWarning, match=r"most images \(4\) is read, the others \(2 images\)"):
+    with pytest.warns(UserWarning, match=r"most images \(4\) is read, the other \(2 images\) is not"):
         assert read_scene(tmp_path).num_images == 4
     first, second = read_opensfm_reconstructions(path)
     assert first.scene.images.names == ("1 x.jpg", "2 x.jpg") and first.reference_lla is None

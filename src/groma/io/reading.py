@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from groma._counted import counted
 from groma.errors import FileFormatError, GromaError, InputError
 
 
@@ -45,9 +46,11 @@ def warn_of_the_others(path: str | os.PathLike[str], num_images: Sequence[int], 
     """Say that of several reconstructions the largest is read; ``num_images`` are those of each, ``where`` it lies."""
     largest, *others = sorted(num_images, reverse=True)
     if others:
+        sizes = ", ".join([*(f"{count:,}" for count in others[:-1]), counted(others[-1], "images")])
+        rest = f"the others ({sizes}) are" if len(others) > 1 else f"the other ({sizes}) is"
         warnings.warn(
             f"{path} holds {len(num_images)} reconstructions in frames of their own. The one with most images "
-            f"({largest:,}{where}) is read, the others ({', '.join(f'{count:,}' for count in others)} images) are not.",
+            f"({largest:,}{where}) is read, {rest} not.",
             stacklevel=3,
         )
 

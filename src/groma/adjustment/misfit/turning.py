@@ -47,6 +47,8 @@ class TurningGates:
 GATES = TurningGates()
 #: Fields of view over the diagonal, degrees, and distortions at which the fit is begun (cost: time).
 _STARTS = tuple((view, k) for view in (30.0, 60.0, 90.0, 120.0) for k in (0.0, -0.3))
+#: Logarithms of focal lengths and coefficients go no farther from where they began; it only guards from overflow.
+_FAR = 7.0
 #: Steps of Newton's method to the radius of a ray, from that of the observation.
 _NEWTON = 3
 
@@ -78,7 +80,8 @@ def motion_that_may_be_turning(scene: Scene, free: bool | None, inliers: Mapping
 
     def unpack(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         moved = so3.exp(np.vstack([np.zeros(3), x[3 * num :].reshape(-1, 3)]))
-        return focal * np.exp(x[:num]), k + x[num : 3 * num].reshape(2, num), moved @ turn
+        lens = np.clip(x[: 3 * num], -_FAR, _FAR).reshape(3, num)
+        return focal * np.exp(lens[0]), k + lens[1:], moved @ turn
 
     begun = [_turned(seen, 1.0 / np.tan(np.radians(view) / 2.0), k, start) for view, k in _STARTS]
     focal, k, turn = min(begun, key=lambda one: float(np.median(_misses(seen, *one))))

@@ -21,6 +21,7 @@ from groma.features.depth.points import depth_at
 from groma.geometry import quaternion
 from groma.io.depth_maps import DepthMap, DepthMaps
 from groma.mapping.depth.noise import cells_of, fitted_noise, shared_errors
+from groma.mapping.depth.registration import BESIDE, sample, shifted_maps
 from groma.mapping.depth.unit import common_unit, own_units, say_left_out
 from groma.mapping.noise.landmarks import point_noise
 from groma.scene import PointDepths, Scene, Similarity
@@ -103,11 +104,17 @@ def measure_depths(
     measured = np.full(len(seen), np.nan)
     for own, (depths, _) in zip(rows, read, strict=True):
         measured[own] = depths
-    used = np.array([known for _, known in read])
+    used = np.array([beside is not None for _, beside in read])
     if not used.any():
         raise InputError(f"None of the depth maps in {maps.folder} holds any depth (all are zero or not finite).")
-    warnings = say_left_out(used, names)
     predicted, sigma = _depths_of_points(points)
+    warnings, width = say_left_out(used, names), np.array([size[0] for size in sizes], float)
+    if not maps.relative:
+        beside = np.concatenate([found for _, found in read if found is not None], axis=1)
+        sampled = np.concatenate(
+            [own[sample(len(own))] for own, (_, found) in zip(rows, read, strict=True) if found is not None]
+        )
+        warnings += shifted_maps(beside, predicted[sampled], float(np.median(width)))
     ratio = np.where(predicted > 0.0, measured / np.where(predicted > 0.0, predicted, 1.0), np.nan)
     units = np.where(used, 1.0, np.nan)
     if maps.relative:
@@ -125,7 +132,6 @@ def measure_depths(
     depth, image = depth[told], seen.image_idx[told]
     difference = depth - scale * predicted[told]
     noise = fitted_noise(depth, difference, scale * sigma[told])
-    width = np.array([size[0] for size in sizes], float)
     cell = cells_of(image, seen.pixel[told], width[image])
     shared = shared_errors(difference / noise.sigma(depth), image, cell)
     table = PointDepths(image, seen.point_idx[told], depth, noise.sigma(depth) * shared.factors(image, cell))
@@ -160,15 +166,17 @@ def read_map(maps: DepthMaps, file: Path, size: tuple[int, int]) -> DepthMap:
     return depth
 
 
-def _depths_in(maps: DepthMaps, image: tuple[Path | None, tuple[int, int], FloatArray]) -> tuple[FloatArray, bool]:
-    """Depths at pixels of one image, and whether its map holds any."""
+def _depths_in(
+    maps: DepthMaps, image: tuple[Path | None, tuple[int, int], FloatArray]
+) -> tuple[FloatArray, FloatArray | None]:
+    """Depths at pixels of one image, and :data:`BESIDE` a sample of them; None where its map holds none."""
     file, size, pixels = image
-    if file is None:
-        return np.full(len(pixels), np.nan), False
-    depth = read_map(maps, file, size)
+    depth = np.zeros((3, 3), np.float32) if file is None else read_map(maps, file, size)
     if not (depth > 0.0).any():
-        return np.full(len(pixels), np.nan), False
-    return depth_at(depth, pixels, np.inf), True
+        return np.full(len(pixels), np.nan), None
+    some = pixels[sample(len(pixels))]
+    beside = [depth_at(depth, some + size[0] * shift, np.inf) for shift in BESIDE]
+    return depth_at(depth, pixels, np.inf), np.stack(beside)
 
 
 def _depths_of_points(scene: Scene) -> tuple[FloatArray, FloatArray]:
