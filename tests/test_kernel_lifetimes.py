@@ -99,7 +99,7 @@ def test_generators_and_plain_python_inside():
 
 
 def _with_dictionary(value):
-    return {1: value, **{2: 2 * value}}
+    return {1: value, **{2: 2 * value}}  # noqa: PIE800 - dictionaries that are joined are what is tested
 
 
 @pytest.mark.parametrize(("function", "count"), [(_nested, 0), (_with_dictionary, 2)])

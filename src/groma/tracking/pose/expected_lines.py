@@ -14,6 +14,7 @@ import math
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.features.segments import SEGMENTS
 from groma.localization.pose.gates import VERDICT
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.features import FrameFeatures
@@ -34,7 +35,7 @@ def line_odds(
     if not data.options.lines:
         return None
     expected = _in_view(track_map, camera, data, keyframes, pose)
-    limits = gates.lines.distance, gates.lines.angle
+    limits = gates.lines.distance, SEGMENTS.angle
     beside = list(poses_beside(camera, pose, VERDICT.distinct * gates.finding.near))
     found, *elsewhere = (
         len(match_lines(track_map, camera, data, place, *limits, expected)[0].index) for place in [pose, *beside]

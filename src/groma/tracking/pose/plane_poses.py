@@ -44,7 +44,9 @@ def poses_on_planes(
     rows = np.array([(*one, *two) for one in first for two in second], np.int64).reshape(-1, 4)
     mine, theirs = own[rows[:, :2], :3], world[rows[:, 2:], :3]
     angle, known_angle = (np.arccos(np.clip((n[:, 0] * n[:, 1]).sum(axis=1), -1.0, 1.0)) for n in (mine, theirs))
-    good = (np.abs(angle - known_angle) < gates.planes.wide_angle) & (np.sin(angle) > gates.finding.crossing)
+    good = (np.abs(angle - known_angle) < gates.planes.wider * gates.planes.angle) & (
+        np.sin(angle) > gates.finding.crossing
+    )
     rows, mine, theirs = rows[good], mine[good], theirs[good]
     rotation = _rotations(mine, theirs)
     turn = se3.compose(_poses(rotation), np.tile(se3.inverse(predicted[None]), (len(rows), 1)))
