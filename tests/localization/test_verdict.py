@@ -8,12 +8,13 @@ import pytest
 from scipy.stats import binom
 from worlds import CAMERA, make_world, pose_of
 
+from groma.geometry import quaternion
 from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose, pose_from_matches
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pieces import cells_elsewhere
 from groma.localization.pose.refinement import fitted, refine
-from groma.localization.pose.verdict import evidence_of, votes_of_a_rival
+from groma.localization.pose.verdict import Shown, evidence_of, votes_of_a_rival
 
 
 def _in_pieces(world, rng, moved):
@@ -50,7 +51,7 @@ def test_poses_with_too_few_votes_are_not_judged():
     votes = evidence_of(found, matches).agree
     asked = []
     for enough in (votes, votes + 1):
-        expected = lambda best: asked.append(best) or ((9.0, 0.0), 1.0)  # noqa: E731
+        expected = lambda best, used: asked.append(best) or Shown(9.0, 0.0)  # noqa: E731
         found = pose_from_matches(CAMERA, matches, expected=expected, enough=enough)
         assert (found.status, len(asked)) == ("localized" if enough == votes else "failed", 1)
 
@@ -78,11 +79,38 @@ def test_what_speaks_against_a_pose_is_told_from_too_few_matches():
     world = make_world(np.random.default_rng(2), points=200)
     matches = Matches(world.points2d, world.points3d)
     for parts, status in (((9.0, 0.0), "localized"), ((1.0, 9.0), "uncertain")):
-        found = pose_from_matches(CAMERA, matches, expected=lambda best, parts=parts: (parts, 1.0))
+        found = pose_from_matches(CAMERA, matches, expected=lambda best, used, parts=parts: Shown(*parts))
         assert (found.status, found.contradicted) == (status, status == "uncertain")
     again = np.concatenate([world.points3d, world.points3d + np.array([1.5, 0.0, 0.0])])
     two = estimate_absolute_pose(CAMERA, np.concatenate([world.points2d, world.points2d]), again)
     assert (two.status, two.contradicted) == ("uncertain", False)
+
+
+@pytest.mark.parametrize("known", [(), (0,), (1,), (0, 1)])
+def test_what_only_one_of_two_places_has_decides_between_them(known):
+    """All landmarks stand again beside themselves, and 120 of 300 are seen at either place alone; what tells the
+    places apart is found at those that are known.
+    """
+    world = make_world(np.random.default_rng(3), points=300)
+    shift = np.array([1.5, 0.0, 0.0])
+    second = world.pose.copy()
+    second[4:] -= quaternion.to_matrix(world.pose[None, :4])[0] @ shift
+    # The poses see each landmark of theirs at the same pixel.
+    points = world.points3d, world.points3d + shift
+    matches = Matches(np.concatenate([world.points2d] * 2), np.concatenate(points))
+    poses = [world.pose, second]
+
+    def expected(best, used):
+        return Shown(9.0, 0.0, 1.0 if nearest(best.pose) in known else 0.0, 0.0)
+
+    def nearest(pose):
+        return int(np.argmin([np.linalg.norm(one[4:] - pose[4:]) for one in poses]))
+
+    found = pose_from_matches(CAMERA, matches, guided=lambda best: matches, expected=expected)
+    if len(known) == 1:
+        assert (found.status, nearest(found.cam_from_world)) == ("localized", known[0])
+    else:
+        assert found.status == "uncertain" and "Two places" in found.sentence
 
 
 def test_what_is_put_together_of_pieces_is_not_believed():
@@ -94,6 +122,18 @@ def test_what_is_put_together_of_pieces_is_not_believed():
         whole = estimate_absolute_pose(CAMERA, _in_pieces(world, rng, [0.0, 0.0]), world.points3d)
         believed.append(whole.status)
     assert believed == ["localized"] * 5
+
+
+def test_a_place_that_repeats_is_no_piece_where_most_of_what_only_it_has_is_there():
+    rng = np.random.default_rng(12)
+    world = make_world(rng, points=300)
+    matches = Matches(_in_pieces(world, rng, [0.0, 150.0]), world.points3d)
+    for whole, status in ((0.3, "uncertain"), (0.6, "localized"), (np.nan, "uncertain")):
+        shown = Shown(9.0, 0.0, 1.0, whole)
+        found = pose_from_matches(
+            CAMERA, matches, PoseOptions(look_for_rival=False), expected=lambda best, used, shown=shown: shown
+        )
+        assert found.status == status
 
 
 def test_cells_that_are_off_like_their_neighbours_are_counted():
