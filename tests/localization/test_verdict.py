@@ -101,7 +101,7 @@ def test_what_only_one_of_two_places_has_decides_between_them(known):
     poses = [world.pose, second]
 
     def expected(best, used):
-        return Shown(9.0, 0.0, 1.0 if nearest(best.pose) in known else 0.0, 0.0)
+        return Shown(9.0, 0.0, float(nearest(best.pose) in known))
 
     def nearest(pose):
         return int(np.argmin([np.linalg.norm(one[4:] - pose[4:]) for one in poses]))
@@ -124,16 +124,28 @@ def test_what_is_put_together_of_pieces_is_not_believed():
     assert believed == ["localized"] * 5
 
 
-def test_a_place_that_repeats_is_no_piece_where_most_of_what_only_it_has_is_there():
-    rng = np.random.default_rng(12)
-    world = make_world(rng, points=300)
-    matches = Matches(_in_pieces(world, rng, [0.0, 150.0]), world.points3d)
-    for whole, status in ((0.3, "uncertain"), (0.6, "localized"), (np.nan, "uncertain")):
-        shown = Shown(9.0, 0.0, 1.0, whole)
+def test_what_is_found_at_a_place_that_is_known_is_no_piece_of_another():
+    """The right half looks like what is beside it as well; near the pose what is there is found, or not."""
+    world = make_world(np.random.default_rng(12), points=300)
+    moved = world.points2d + np.array([0.0, 150.0])
+    matches = Matches(np.where(world.points2d[:, :1] > CAMERA.width / 2, moved, world.points2d), world.points3d)
+    rays = CAMERA.kind.unproject(CAMERA.params, np.ascontiguousarray(matches.points2d))
+    R = quaternion.to_matrix(world.pose[None, :4])[0]
+    at_the_place = Matches(matches.points2d, (rays / rays[:, 2:] * 5.0 - world.pose[4:]) @ R)
+    for near, alone, status in (
+        (at_the_place, 1.0, "localized"),
+        (matches, 1.0, "uncertain"),
+        (at_the_place, 0.0, "uncertain"),
+        (at_the_place, np.nan, "uncertain"),
+    ):
         found = pose_from_matches(
-            CAMERA, matches, PoseOptions(look_for_rival=False), expected=lambda best, used, shown=shown: shown
+            CAMERA,
+            matches,
+            PoseOptions(look_for_rival=False),
+            guided=lambda best, near=near: near,
+            expected=lambda best, used, alone=alone: Shown(9.0, 0.0, alone),
         )
-        assert found.status == status
+        assert found.status == status, found.sentence
 
 
 def test_cells_that_are_off_like_their_neighbours_are_counted():
@@ -146,7 +158,9 @@ def test_cells_that_are_off_like_their_neighbours_are_counted():
         pixels[rows] = rng.uniform((0, 0), (CAMERA.width, CAMERA.height), (wrong, 2))
         matches = Matches(pixels, world.points3d)
         found = fitted(CAMERA, matches, pose, (7.0, 7.0))
-        assert low <= cells_elsewhere(found, matches, 34.0) <= high
+        assert low <= cells_elsewhere(found, matches, 34.0, np.zeros((0, 2))) <= high
+        # Whatever shows the place is no piece of another.
+        assert cells_elsewhere(found, matches, 34.0, pixels) == 0
 
 
 def test_a_rival_needs_so_many_votes():

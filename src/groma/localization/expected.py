@@ -111,21 +111,19 @@ def shown_of(
         known = np.unique(scene.line_observations.line_idx[index.segment[rows]])
         expected.append((*_lengths(camera, best.pose, scene.lines.segments[known]), 0.5 * side))
     parts = _counted(camera, expected, shown, VERDICT.parts)
-    return Shown(*parts, *_telling_found(rate, telling, *(np.isin(point, some) for some in found)))
+    return Shown(*parts, _telling_found(rate, telling, *(np.isin(point, some) for some in found)))
 
 
-def _telling_found(rate: FloatArray, telling: FloatArray, found: BoolArray, itself: BoolArray) -> tuple[float, float]:
-    """How often telling points are found, as a share of how often all are, and of how often the map finds them again;
-    NaN where hardly any are expected.
+def _telling_found(rate: FloatArray, telling: FloatArray, found: BoolArray, itself: BoolArray) -> float:
+    """How often telling points are found, as a share of how often all are; NaN where hardly any are expected.
 
     It is the lower limit of the mean of a Poisson variable, at ``VERDICT.often`` (Garwood 1936).
     """
     often = min(1.0, float(found.sum()) / max(float(rate.sum()), 1e-12))
-    expected, count = float(rate @ telling), int((itself & (telling > 0.0)).sum())
-    if often * expected < VERDICT.expected:
-        return math.nan, math.nan
-    least = float(gammaincinv(count, VERDICT.often)) if count else 0.0
-    return least / (often * expected), least / expected
+    expected, count = often * float(rate @ telling), int((itself & (telling > 0.0)).sum())
+    if expected < VERDICT.expected:
+        return math.nan
+    return float(gammaincinv(count, VERDICT.often)) / expected if count else 0.0
 
 
 def _counted(

@@ -254,7 +254,7 @@ def pose_from_matches(
     rival = None if other is None else other[1]
     if guided is not None and expected is not None and other is not None and fits_as_well(here.evidence, rival):
         there = near(other[0])
-        known = [expected(place.best, place.used).alone >= VERDICT.alone for place in (here, there)]
+        known = [expected(place.best, place.used).known for place in (here, there)]
         if known[0] != known[1]:
             rival = None
         if known[1] and not known[0]:
@@ -280,8 +280,9 @@ def _judged(
     verdict = judge(best, covariance, distance, first, other[1])
     supported = verdict.status == "localized"
     shown = expected(best, used) if expected is not None and supported else Shown(0.0, 0.0)
-    if supported and not shown.whole >= VERDICT.alone:
-        elsewhere = cells_elsewhere(here.own, matches, VERDICT.distinct * max_errors(matches)[0])
+    if supported:
+        there = used.points2d[best.point_inliers & shown.known]
+        elsewhere = cells_elsewhere(here.own, matches, VERDICT.distinct * max_errors(matches)[0], there)
         verdict = doubted_if_in_pieces(verdict, first.agree, elsewhere)
         supported = verdict.status == "localized" or elsewhere > first.agree
     if verdict.status == "localized":

@@ -74,8 +74,12 @@ class VerdictGates:
         0.99, "probability", "that more of what is expected is there than is missing", "chosen on the filing cabinet"
     )
     alone: float = gate(
-        0.5, "share", "of how often all points are found, that telling ones are found at least",
-        "chosen on rendered facades: up to 0.36 in another place that looks like this one",
+        0.33, "share", "of how often all points are found, that telling ones are found at least",
+        "chosen on rendered facades: up to 0.29 where a photograph of another place fits best",
+    )  # fmt: skip
+    known: float = gate(
+        0.5, "share", "of the same, where they decide against another place that fits as well",
+        "chosen on rendered facades: up to 0.36 in other places, rivals of the right one among them",
     )  # fmt: skip
     often: float = gate(
         0.01, "probability", "that telling points are found less often than that", "convention: 1 in 100"

@@ -20,7 +20,7 @@ fall to either with the same probability; the first is the right one with the pr
 finds it again in its own images (:mod:`groma.localization.expected`). Where about as much is missing as is there, by
 the same test, a piece of the place is shown, or something that is like it. So it is with points that are told from all
 other places of the map: where what repeats is found and they are not, another place that looks like this one is shown.
-Where they are found, this place is shown, though others fit as well, and parts of it would fit elsewhere, too.
+Where they are found, this place is shown, though others fit as well, and parts that are there would fit elsewhere, too.
 
 Reference: L. Moisan, B. Stival, *A probabilistic criterion to detect rigid point matches between two images and
 estimate the fundamental matrix*, 2004, eq. (9), for samples of three.
@@ -78,10 +78,14 @@ class Shown(NamedTuple):
     #: Parts of the image that show something of it, and that show nothing.
     parts: float
     missing: float
-    #: How often points that tell the place from others are found at least: as a share of how often all of its points
-    #: are, and of how often the map finds them again. NaN where it has no such points.
+    #: How often points that tell the place from others are found at least, as a share of how often all of its points
+    #: are; NaN where it has no such points.
     alone: float = math.nan
-    whole: float = math.nan
+
+    @property
+    def known(self) -> bool:
+        """Whether what only this place has is surely there."""
+        return self.alone >= VERDICT.known
 
 
 def evidence_of(refined: Refined, matches: Matches, places: int = 1) -> Evidence:
