@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -81,8 +82,7 @@ class MirrorQuestions:
     closest: Callable[[Refined, Matches, Refined], tuple[int, int]]
 
 
-@dataclass(frozen=True, eq=False)
-class _Place:
+class _Place(NamedTuple):
     """A pose: fitted to all that is near, and at that pose fitted to what was matched without it."""
 
     best: Refined
@@ -236,7 +236,6 @@ def pose_from_matches(
     if best is None:
         return _failed(camera, matches)
     first = evidence_of(best, matches, places)
-    here = _Place(best, matches, best, first)
 
     def near(start: Refined) -> _Place:
         assert guided is not None
@@ -246,8 +245,7 @@ def pose_from_matches(
         own = fitted_at(best.one.at(whole.pose, whole.camera.params), whole.camera, matches, errors, lens)
         return _Place(whole, used, own, evidence_of(own, matches, places))
 
-    if guided is not None and first.significant:
-        here = near(best)
+    here = near(best) if guided is not None and first.significant else _Place(best, matches, best, first)
     if here.evidence.agree < enough:
         return _failed(camera, matches)
     other = _rival(matches, best, options, places, first) if options.look_for_rival and first.significant else None
@@ -255,8 +253,7 @@ def pose_from_matches(
     if guided is not None and expected is not None and other is not None and fits_as_well(here.evidence, rival):
         there = near(other[0])
         known = [expected(place.best, place.used).known for place in (here, there)]
-        if known[0] != known[1]:
-            rival = None
+        rival = rival if known[0] == known[1] else None
         if known[1] and not known[0]:
             here, other = there, (best, first)
     return _judged(here, matches, options, (other, rival), mirror, expected, common)
@@ -276,8 +273,7 @@ def _judged(
     covariance = best.covariance(used)
     if common is not None and np.isfinite(covariance).all():
         covariance = covariance + common(best, used)
-    distance = median_distance(best.pose, _seen(used, best))
-    verdict = judge(best, covariance, distance, first, other[1])
+    verdict = judge(best, covariance, median_distance(best.pose, _seen(used, best)), first, other[1])
     supported = verdict.status == "localized"
     shown = expected(best, used) if expected is not None and supported else Shown(0.0, 0.0)
     if supported:
@@ -317,18 +313,17 @@ def _unless_mirrored(
     Some of its points are matched first: mostly far too few of them agree with any pose.
     """
     points = matches.take(np.ones(matches.num_points, bool), np.zeros(matches.num_lines, bool))
-    own = here.own
-    agree = len(np.unique(cells_of(points.points2d, own.camera, VERDICT.cells)[own.point_inliers]))
+    agree = len(np.unique(cells_of(points.points2d, here.own.camera, VERDICT.cells)[here.own.point_inliers]))
     wanted = votes_of_a_rival(agree)
     parts = [(step, votes_of_a_part(wanted, 1.0 / step)) for step in _SOME]
     step, votes = next((one for one in parts if one[1] >= _VOTES), parts[-1])
     if votes:
         some = mirror.matches(step)
-        other = _best_of_others(own.camera, some, options, votes)
+        other = _best_of_others(here.own.camera, some, options, votes)
         if other is None or evidence_of(other, some).agree < votes:
             return verdict
     every = mirror.matches(1)
-    other = _best_of_others(own.camera, every, options, wanted)
+    other = _best_of_others(here.own.camera, every, options, wanted)
     if other is None:
         return verdict
     evidence = evidence_of(other, every)
@@ -346,8 +341,7 @@ def _best_of_others(camera: QueryCamera, matches: Matches, options: PoseOptions,
     possible = most_votes(matches, camera)
     if possible < max(votes, 1):
         return None
-    only_this = replace(options, refine_lens=False, focal_factors=(1.0,))
-    return _best(camera, matches, only_this, votes / possible, votes)
+    return _best(camera, matches, replace(options, refine_lens=False, focal_factors=(1.0,)), votes / possible, votes)
 
 
 def _best(
