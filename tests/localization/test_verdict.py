@@ -101,7 +101,7 @@ def test_what_only_one_of_two_places_has_decides_between_them(known):
     poses = [world.pose, second]
 
     def expected(best, used):
-        return Shown(9.0, 0.0, float(nearest(best.pose) in known))
+        return Shown(9.0, 0.0, 1.0, *(30 * (nearest(best.pose) in known), 20.0))
 
     def nearest(pose):
         return int(np.argmin([np.linalg.norm(one[4:] - pose[4:]) for one in poses]))
@@ -124,6 +124,14 @@ def test_what_is_put_together_of_pieces_is_not_believed():
     assert believed == ["localized"] * 5
 
 
+def test_a_place_is_known_beside_another_only_where_more_of_it_is_found():
+    """Eight of 5.5 are well above what other places have, and hardly more than 10 of 11."""
+    first, second = Shown(9.0, 0.0, found=10, expected=11.2), Shown(9.0, 0.0, found=12, expected=5.5)
+    assert second.known and not second.is_known_beside(first)
+    assert Shown(9.0, 0.0, found=22, expected=17.9).is_known_beside(Shown(9.0, 0.0, found=7, expected=23.3))
+    assert not Shown(9.0, 0.0).known and not Shown(9.0, 0.0).is_known_beside(first)
+
+
 def test_what_is_found_at_a_place_that_is_known_is_no_piece_of_another():
     """The right half looks like what is beside it as well; near the pose what is there is found, or not."""
     world = make_world(np.random.default_rng(12), points=300)
@@ -132,18 +140,17 @@ def test_what_is_found_at_a_place_that_is_known_is_no_piece_of_another():
     rays = CAMERA.kind.unproject(CAMERA.params, np.ascontiguousarray(matches.points2d))
     R = quaternion.to_matrix(world.pose[None, :4])[0]
     at_the_place = Matches(matches.points2d, (rays / rays[:, 2:] * 5.0 - world.pose[4:]) @ R)
-    for near, alone, status in (
-        (at_the_place, 1.0, "localized"),
-        (matches, 1.0, "uncertain"),
-        (at_the_place, 0.0, "uncertain"),
-        (at_the_place, np.nan, "uncertain"),
+    for near, telling, status in (
+        (at_the_place, 30, "localized"),
+        (matches, 30, "uncertain"),
+        (at_the_place, 5, "uncertain"),
     ):
         found = pose_from_matches(
             CAMERA,
             matches,
             PoseOptions(look_for_rival=False),
             guided=lambda best, near=near: near,
-            expected=lambda best, used, alone=alone: Shown(9.0, 0.0, alone),
+            expected=lambda best, used, telling=telling: Shown(9.0, 0.0, 1.0, telling, 20.0),
         )
         assert found.status == status, found.sentence
 

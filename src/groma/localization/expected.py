@@ -14,20 +14,19 @@ limit of how often they are.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammaincinv
 
-from groma._typing import BoolArray, FloatArray, IntArray
+from groma._typing import FloatArray, IntArray
 from groma.localization.landmarks import counted_in
 from groma.localization.map_index import MapIndex
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.refinement import Refined
-from groma.localization.pose.verdict import Shown
+from groma.localization.pose.verdict import Shown, at_least
+from groma.localization.repeated import GATES as REPEATED
 from groma.scene import Scene
 
 #: Images of a map that are asked how often points are found again, at most (cost: time).
@@ -111,19 +110,11 @@ def shown_of(
         known = np.unique(scene.line_observations.line_idx[index.segment[rows]])
         expected.append((*_lengths(camera, best.pose, scene.lines.segments[known]), 0.5 * side))
     parts = _counted(camera, expected, shown, VERDICT.parts)
-    return Shown(*parts, _telling_found(rate, telling, *(np.isin(point, some) for some in found)))
-
-
-def _telling_found(rate: FloatArray, telling: FloatArray, found: BoolArray, itself: BoolArray) -> float:
-    """How often telling points are found, as a share of how often all are; NaN where hardly any are expected.
-
-    It is the lower limit of the mean of a Poisson variable, at ``VERDICT.often`` (Garwood 1936).
-    """
-    often = min(1.0, float(found.sum()) / max(float(rate.sum()), 1e-12))
-    expected, count = often * float(rate @ telling), int((itself & (telling > 0.0)).sum())
-    if expected < VERDICT.expected:
-        return math.nan
-    return float(gammaincinv(count, VERDICT.often)) / expected if count else 0.0
+    alike, itself = (np.isin(point, some) for some in found)
+    often = min(1.0, float(alike.sum()) / max(float(rate.sum()), 1e-12))
+    unique = telling >= REPEATED.alike
+    alone = at_least(int(alike[unique].sum()), often * float(rate[unique].sum()))
+    return Shown(*parts, alone, int((itself & (telling > 0.0)).sum()), often * float(rate @ telling))
 
 
 def _counted(

@@ -60,7 +60,8 @@ class Telling(NamedTuple):
 
     #: (P,) distances of descriptors within which a view is one of the point, and of no other place.
     within: FloatArray
-    #: (P,) share of the views of a point that are; zero where they are too few to tell.
+    #: (P,) share of the views of a point that are; zero where they are too few to tell, and that of all that look alike
+    #: where nothing else does.
     share: FloatArray
 
 
@@ -116,7 +117,8 @@ def telling_points(
     within[described.point] = np.minimum(nearest[described.point], most[kind])
     for upright, far in enumerate(same):
         point = np.unique(described.point[kind == upright])
-        share[point] = np.searchsorted(far, within[point], "right") / max(len(far), 1)
+        near = np.searchsorted(far, within[point], "right") / max(len(far), 1)
+        share[point] = np.where(within[point] < most[int(upright)], near, GATES.alike)
     return Telling(within, np.where(share > GATES.telling, share, 0.0))
 
 

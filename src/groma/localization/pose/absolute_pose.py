@@ -252,9 +252,9 @@ def pose_from_matches(
     rival = None if other is None else other[1]
     if guided is not None and expected is not None and other is not None and fits_as_well(here.evidence, rival):
         there = near(other[0])
-        known = [expected(place.best, place.used).known for place in (here, there)]
-        rival = rival if known[0] == known[1] else None
-        if known[1] and not known[0]:
+        one, two = (expected(place.best, place.used) for place in (here, there))
+        rival = None if one.is_known_beside(two) or two.is_known_beside(one) else rival
+        if two.is_known_beside(one):
             here, other = there, (best, first)
     return _judged(here, matches, options, (other, rival), mirror, expected, common)
 
@@ -282,7 +282,7 @@ def _judged(
         verdict = doubted_if_in_pieces(verdict, first.agree, elsewhere)
         supported = verdict.status == "localized" or elsewhere > first.agree
     if verdict.status == "localized":
-        verdict = doubted_if_repeated(doubted_if_missing(verdict, shown.parts, shown.missing), shown.alone)
+        verdict = doubted_if_repeated(doubted_if_missing(verdict, shown.parts, shown.missing), shown)
     if mirror is not None and verdict.status == "localized":
         verdict = _unless_mirrored(verdict, here, mirror, matches, options)
     if not options.refine_lens and verdict.status == "localized":

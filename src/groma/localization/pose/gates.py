@@ -74,12 +74,12 @@ class VerdictGates:
         0.99, "probability", "that more of what is expected is there than is missing", "chosen on the filing cabinet"
     )
     alone: float = gate(
-        0.33, "share", "of how often all points are found, that telling ones are found at least",
-        "chosen on rendered facades: up to 0.29 where a photograph of another place fits best",
+        0.25, "share", "of how often all points are found, that unique ones are found at least",
+        "chosen on rendered facades: what is found in another place that looks like this one",
     )  # fmt: skip
     known: float = gate(
-        0.5, "share", "of the same, where they decide against another place that fits as well",
-        "chosen on rendered facades: up to 0.36 in other places, rivals of the right one among them",
+        0.6, "share", "of the same, of telling ones, where they decide for a place",
+        "chosen on five rendered facades: up to 0.53 in other places",
     )  # fmt: skip
     often: float = gate(
         0.01, "probability", "that telling points are found less often than that", "convention: 1 in 100"

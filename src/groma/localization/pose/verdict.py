@@ -78,14 +78,37 @@ class Shown(NamedTuple):
     #: Parts of the image that show something of it, and that show nothing.
     parts: float
     missing: float
-    #: How often points that tell the place from others are found at least, as a share of how often all of its points
-    #: are; NaN where it has no such points.
+    #: How often points that look like no other place are found at least, as a share of how often all are; NaN where the
+    #: place has no such points.
     alone: float = math.nan
+    #: How many points that tell the place from others are found, and how many are expected.
+    found: int = 0
+    expected: float = 0.0
 
     @property
     def known(self) -> bool:
         """Whether what only this place has is surely there."""
-        return self.alone >= VERDICT.known
+        return at_least(self.found, self.expected) >= VERDICT.known
+
+    def is_known_beside(self, other: Shown) -> bool:
+        """Whether what only this place has is surely there, and more often than what only another has is."""
+        from scipy.special import bdtrc
+
+        share = self.expected / max(self.expected + other.expected, 1e-12)
+        chance = bdtrc(self.found - 1, self.found + other.found, share) if self.found else 1.0
+        return self.known and chance <= VERDICT.often
+
+
+def at_least(found: int, expected: float) -> float:
+    """How much of what is expected is there at least; NaN where that is hardly anything.
+
+    It is the lower limit of the mean of a Poisson variable, at ``VERDICT.often`` (Garwood 1936).
+    """
+    from scipy.special import gammaincinv
+
+    if expected < VERDICT.expected:
+        return math.nan
+    return float(gammaincinv(found, VERDICT.often)) / expected if found else 0.0
 
 
 def evidence_of(refined: Refined, matches: Matches, places: int = 1) -> Evidence:
@@ -200,17 +223,16 @@ def doubted_if_missing(verdict: Verdict, shown: float, missing: float) -> Verdic
     return Verdict("uncertain", 1.0 - VERDICT.right, words)
 
 
-def doubted_if_repeated(verdict: Verdict, often: float) -> Verdict:
+def doubted_if_repeated(verdict: Verdict, shown: Shown) -> Verdict:
     """Return a verdict, or ``uncertain`` where what only this place has is not surely found.
 
-    ``often`` is how often points that tell it from others are found at least, as a share of how often all points are:
-    about one in this place, less in another that looks like it; NaN where it has no such points.
+    That is where points that look like no other may be missing, and those that tell it from others are too few.
     """
-    if verdict.status != "localized" or not often < VERDICT.alone:
+    if verdict.status != "localized" or shown.known or not shown.alone < VERDICT.alone:
         return verdict
     words = (
-        f"{verdict.sentence} But points that look like no other place may be found only {100 * often:.0f} % as often "
-        "as all: the photograph may show another place that looks like this one."
+        f"{verdict.sentence} But points that look like no other place may be found only {100 * shown.alone:.0f} % as "
+        "often as all: the photograph may show another place that looks like this one."
     )
     return Verdict("uncertain", 1.0 - VERDICT.right, words)
 
