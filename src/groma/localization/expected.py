@@ -39,7 +39,7 @@ _PIECES = 8
 class FoundAgain:
     """How often points of a map are found again, learned from its own images."""
 
-    #: (2, N + 1) of points that repeat, and of telling ones, by the number of images near a photograph, of N, that see
+    #: (2, N + 1) of points that repeat, and of unique ones, by the number of images near a photograph, of N, that see
     #: them.
     rate: FloatArray
 
@@ -59,7 +59,7 @@ class FoundAgain:
             rows = total[point] - itself[point] >= 2  # points that are in the map without this image
             camera = QueryCamera.of(scene.cameras, int(scene.images.camera_idx[image]))
             rows[rows] = camera.inside(camera.project(scene.cam_from_world[image], index.xyz[point[rows]]))
-            kind = (index.telling[point[rows]] > 0.0).astype(np.int64), times[rows]
+            kind = (index.telling[point[rows]] >= REPEATED.alike).astype(np.int64), times[rows]
             np.add.at(asked, kind, 1.0)
             np.add.at(found, kind, itself[point[rows]])
         return FoundAgain(found / asked)
@@ -103,7 +103,8 @@ def shown_of(
     pixel = camera.project(best.pose, index.xyz[point])
     inside = camera.inside(pixel)
     point, pixel, telling = point[inside], pixel[inside], index.telling[point[inside]]
-    rate = again.rate[(telling > 0.0).astype(np.int64), times[inside]]
+    unique = telling >= REPEATED.alike
+    rate = again.rate[unique.astype(np.int64), times[inside]]
     expected = [(pixel, rate, VERDICT.expected)]
     if lines and scene.num_lines:
         rows = np.concatenate([np.arange(int(index.segment_begin[i]), int(index.segment_begin[i + 1])) for i in near])
@@ -112,7 +113,6 @@ def shown_of(
     parts = _counted(camera, expected, shown, VERDICT.parts)
     alike, itself = (np.isin(point, some) for some in found)
     often = min(1.0, float(alike.sum()) / max(float(rate.sum()), 1e-12))
-    unique = telling >= REPEATED.alike
     alone = at_least(int(alike[unique].sum()), often * float(rate[unique].sum()))
     return Shown(*parts, alone, int((itself & (telling > 0.0)).sum()), often * float(rate @ telling))
 
