@@ -9,21 +9,22 @@ from worlds import CAMERA, make_world
 
 from groma.geometry import se3
 from groma.localization.expected import FoundAgain, nearest_images, shown_of
+from groma.localization.features import unit
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.verdict import Verdict, doubted_if_missing, doubted_if_repeated
-from groma.localization.repeated import Described, most_alike, unique_points
+from groma.localization.repeated import Described, alike_limits, most_alike, telling_points
 from groma.scene import Cameras
 
 RIGHT = Verdict("localized", 1.0, "all agree.")
 
 
-def _index(seen, xyz, segments=None, unique=()):
+def _index(seen, xyz, segments=None, telling=()):
     """An index of points (rows seen by each image) and of line observations (rows of each image)."""
     segments = [[] for _ in seen] if segments is None else segments
     return SimpleNamespace(
         image=np.zeros((len(seen), 1)),
         xyz=xyz,
-        unique=np.isin(np.arange(len(xyz)), unique),
+        telling=np.isin(np.arange(len(xyz)), telling).astype(float),
         begin=np.concatenate([[0], np.cumsum([len(rows) for rows in seen])]),
         point=np.concatenate([np.asarray(rows, np.int64) for rows in seen]),
         segment_begin=np.concatenate([[0], np.cumsum([len(rows) for rows in segments])]),
@@ -53,7 +54,7 @@ def _best(world, points, lines):
 def _parts(scene, index, rate, near, best, matches, lines=True):
     """Parts that are shown and missing, if points are found again so often."""
     found = np.flatnonzero(best.point_inliers)
-    return shown_of(scene, index, FoundAgain(np.tile(rate, (2, 1))), near, best, matches, found, lines)[0]
+    return shown_of(scene, index, FoundAgain(np.tile(rate, (2, 1))), near, best, matches, (found, found), lines)[:2]
 
 
 def test_how_often_points_are_found_again_is_learned_from_the_map():
@@ -66,8 +67,8 @@ def test_how_often_points_are_found_again_is_learned_from_the_map():
     assert again.rate[0, 1] == pytest.approx(0.2, abs=0.05)
     assert again.rate[0, 4] == pytest.approx(0.9, abs=0.03)
     assert again.rate[0, 0] == 0.0
-    assert not again.rate[1].any()  # none is unique
-    again = FoundAgain.of(_scene(world, 8, 0), _index(seen, world.points3d, unique=np.arange(2000)), 4)
+    assert not again.rate[1].any()  # none tells
+    again = FoundAgain.of(_scene(world, 8, 0), _index(seen, world.points3d, telling=np.arange(2000)), 4)
     assert again.rate[1, 3] == pytest.approx(0.9, abs=0.05)
     assert again.rate[0, 3] == pytest.approx(0.2, abs=0.05)
 
@@ -129,43 +130,48 @@ def test_lines_behind_the_camera_are_not_expected():
 
 
 def test_what_only_this_place_has_is_to_be_found_as_often_as_the_rest():
-    """A third of the points look like no other place. The map finds 60 % of its points again, the photograph 30 %."""
+    """A third of the points tell the place. The map finds 60 % of its points again, the photograph 30 %."""
     rng = np.random.default_rng(4)
     world = make_world(rng, points=1500, lines=1)
-    unique = np.arange(1500) % 3 == 0
-    index, scene = _index([np.arange(1500)] * 2, world.points3d, unique=np.flatnonzero(unique)), _scene(world, 2, 0)
+    telling = np.arange(1500) % 3 == 0
+    index, scene = _index([np.arange(1500)] * 2, world.points3d, telling=np.flatnonzero(telling)), _scene(world, 2, 0)
     again = FoundAgain(np.array([[0.0, 0.0, 0.6]] * 2))
 
-    def told(chance_unique, chance):
-        return shares(rng.random(1500) < np.where(unique, chance_unique, chance))
+    def told(chance_telling, chance):
+        return shares(rng.random(1500) < np.where(telling, chance_telling, chance))
 
     def shares(agree):
         best, matches = _best(world, agree, np.zeros(1, bool))
-        parts, alone = shown_of(scene, index, again, np.arange(2), best, matches, np.flatnonzero(agree))
-        assert doubted_if_missing(RIGHT, *parts) is RIGHT
-        return alone
+        shown = shown_of(scene, index, again, np.arange(2), best, matches, (np.flatnonzero(agree),) * 2)
+        assert doubted_if_missing(RIGHT, *shown[:2]) is RIGHT
+        return shown
 
     right, wrong = told(0.3, 0.3), told(0.05, 0.425)
-    assert right == pytest.approx(0.82, abs=0.13)  # the lower limit of 150: 123
-    assert wrong < 0.05 / 0.3
+    assert right.alone == pytest.approx(0.82, abs=0.13)  # the lower limit of 150: 123
+    assert right.known
+    assert wrong.alone < 0.05 / 0.3 and not wrong.known
     assert doubted_if_repeated(RIGHT, right) is RIGHT
     assert doubted_if_repeated(RIGHT, wrong).status == "uncertain"
     assert "looks like" in doubted_if_repeated(RIGHT, wrong).sentence
-    assert told(0.0, 0.4) == 0.0
-    # Of 30 unique points 15 are expected, as often as of the others. Another place may well have eight of them, not 14.
-    index.unique[:] = np.arange(1500) < 30
+    assert told(0.0, 0.4).alone == 0.0
+    # Of points that have their like elsewhere, nine of ten views are nearer to them: they tell, and are not unique.
+    index.telling[:] *= 0.9
+    assert np.isnan(told(0.3, 0.3).alone) and told(0.3, 0.3).known and not told(0.1, 0.4).known
+    # Of 60 telling points 30 are expected, as often as of the others. Another place may have twelve of them, not 25.
+    index.telling[:] = np.arange(1500) < 60
     half = np.arange(1500) % 2 == 0
-    for found, status in ((8, "uncertain"), (14, "localized")):
-        agree = np.where(index.unique, np.arange(1500) < found, half)
+    for found, status in ((12, "uncertain"), (25, "localized")):
+        agree = np.where(index.telling > 0.0, np.arange(1500) < found, half)
         assert doubted_if_repeated(RIGHT, shares(agree)).status == status
     doubted = Verdict("uncertain", 0.5, "of something else.")
     assert doubted_if_repeated(doubted, wrong) is doubted
     # Too few to say anything.
-    index.unique[:] = np.arange(1500) < 3
-    assert told(0.0, 0.3) == 1.0
+    index.telling[:] = np.arange(1500) < 3
+    assert np.isnan(told(0.0, 0.3).alone)
+    assert doubted_if_repeated(RIGHT, told(0.0, 0.3)) is RIGHT
 
 
-def test_points_are_unique_where_nothing_else_in_the_image_is_described_like_them():
+def test_points_tell_where_nothing_else_in_the_image_is_described_like_them():
     """Forty things, ten of which stand twice in every image; each view of a thing has noise."""
     rng = np.random.default_rng(5)
     things = rng.integers(0, 120, (40, 128))
@@ -174,17 +180,36 @@ def test_points_are_unique_where_nothing_else_in_the_image_is_described_like_the
     seen = np.clip(np.tile(things[thing], (images, 1)) + rng.normal(0, 3, (150, 128)), 0, 255).astype(np.uint8)
     for upright in (False, True):
         described = Described(np.tile(np.arange(50), images), np.tile(pixels, (images, 1)), seen, np.full(150, upright))
-        unique = unique_points(*_compared(described, 640.0), 51)
+        within, share = telling_points(*_compared(described, 640.0), 51)
         expected = np.ones(51, bool)
         expected[[*range(10), *range(40, 50)]] = False
         expected[50] = False  # nobody sees it
-        assert (unique == expected).mean() > 0.95
-        assert not unique[~expected].any()
+        np.testing.assert_array_equal(share > 0.0, expected)
+        # Nothing else is near: a view of the point is what looks like it.
+        assert within[expected] == pytest.approx(alike_limits(described)[int(upright)])
+        assert share[expected] == pytest.approx(0.95, abs=0.02)
     # The same thing beside itself is one place.
-    assert unique_points(*_compared(described, 32.0 * 600.0), 51)[:50].all()
+    assert (telling_points(*_compared(described, 32.0 * 600.0), 51).share[:50] > 0.0).all()
 
 
-def test_a_thing_alone_in_its_image_is_not_unique_where_another_image_shows_its_like():
+def test_points_tell_where_their_views_are_more_alike_than_the_most_alike_other_place():
+    """A second thing stands beside each, and differs from it by more or less than views of one do."""
+    rng, shares = np.random.default_rng(7), []
+    things = rng.integers(60, 180, (25, 128))
+    pixels = np.column_stack([np.arange(50) * 10.0, np.full(50, 100.0)])
+    for unlike in (2.0, 30.0):
+        both = np.concatenate([things, things + rng.normal(0.0, unlike, things.shape)])
+        noise = rng.uniform(1.0, 6.0, (150, 1)) * rng.normal(size=(150, 128))
+        seen = np.clip(np.tile(both, (3, 1)) + noise, 0, 255).astype(np.uint8)
+        described = Described(np.tile(np.arange(50), 3), np.tile(pixels, (3, 1)), seen, np.zeros(150, bool))
+        within, share = telling_points(*_compared(described, 640.0), 51)
+        shares.append(share[:50])
+        far = np.linalg.norm(unit(seen[:50]) - unit(seen[50:100]), axis=1)
+    assert shares[0].max() == 0.0
+    assert (far <= within[:50]).mean() == pytest.approx(shares[1].mean(), abs=0.1)
+
+
+def test_a_thing_alone_in_its_image_does_not_tell_where_another_image_shows_its_like():
     """Two things of twenty in each of two images of different places are alike."""
     rng = np.random.default_rng(6)
     things = rng.integers(0, 120, (38, 128))
@@ -197,10 +222,10 @@ def test_a_thing_alone_in_its_image_is_not_unique_where_another_image_shows_its_
     def nowhere(image, points):
         return np.full((len(points), 2), np.nan)
 
-    alone = unique_points(described, begin, sides, np.zeros((2, 0), np.int64), nowhere, 40)
-    together = unique_points(described, begin, sides, np.array([[1], [0]]), nowhere, 40)
+    alone = telling_points(described, begin, sides, np.zeros((2, 0), np.int64), nowhere, 40).share
+    together = telling_points(described, begin, sides, np.array([[1], [0]]), nowhere, 40).share
     assert alone.all()
-    np.testing.assert_array_equal(np.flatnonzero(~together), [0, 1, 20, 21])
+    np.testing.assert_array_equal(np.flatnonzero(together == 0.0), [0, 1, 20, 21])
 
 
 def test_the_most_alike_images_are_others():
@@ -210,6 +235,6 @@ def test_the_most_alike_images_are_others():
 
 
 def _compared(described, side):
-    """What :func:`unique_points` takes of three images of one place, seen at the same pixels."""
+    """What :func:`telling_points` takes of three images of one place, seen at the same pixels."""
     place = described.pixel[:50]
     return described, np.arange(0, 200, 50), np.full(3, side), np.array([[1, 2], [0, 2], [0, 1]]), lambda i, p: place[p]

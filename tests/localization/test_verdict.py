@@ -8,12 +8,13 @@ import pytest
 from scipy.stats import binom
 from worlds import CAMERA, make_world, pose_of
 
+from groma.geometry import quaternion
 from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose, pose_from_matches
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pieces import cells_elsewhere
 from groma.localization.pose.refinement import fitted, refine
-from groma.localization.pose.verdict import evidence_of, votes_of_a_rival
+from groma.localization.pose.verdict import Shown, evidence_of, votes_of_a_rival
 
 
 def _in_pieces(world, rng, moved):
@@ -50,7 +51,7 @@ def test_poses_with_too_few_votes_are_not_judged():
     votes = evidence_of(found, matches).agree
     asked = []
     for enough in (votes, votes + 1):
-        expected = lambda best: asked.append(best) or ((9.0, 0.0), 1.0)  # noqa: E731
+        expected = lambda best, used: asked.append(best) or Shown(9.0, 0.0)  # noqa: E731
         found = pose_from_matches(CAMERA, matches, expected=expected, enough=enough)
         assert (found.status, len(asked)) == ("localized" if enough == votes else "failed", 1)
 
@@ -78,11 +79,38 @@ def test_what_speaks_against_a_pose_is_told_from_too_few_matches():
     world = make_world(np.random.default_rng(2), points=200)
     matches = Matches(world.points2d, world.points3d)
     for parts, status in (((9.0, 0.0), "localized"), ((1.0, 9.0), "uncertain")):
-        found = pose_from_matches(CAMERA, matches, expected=lambda best, parts=parts: (parts, 1.0))
+        found = pose_from_matches(CAMERA, matches, expected=lambda best, used, parts=parts: Shown(*parts))
         assert (found.status, found.contradicted) == (status, status == "uncertain")
     again = np.concatenate([world.points3d, world.points3d + np.array([1.5, 0.0, 0.0])])
     two = estimate_absolute_pose(CAMERA, np.concatenate([world.points2d, world.points2d]), again)
     assert (two.status, two.contradicted) == ("uncertain", False)
+
+
+@pytest.mark.parametrize("known", [(), (0,), (1,), (0, 1)])
+def test_what_only_one_of_two_places_has_decides_between_them(known):
+    """All landmarks stand again beside themselves, and 120 of 300 are seen at either place alone; what tells the
+    places apart is found at those that are known.
+    """
+    world = make_world(np.random.default_rng(3), points=300)
+    shift = np.array([1.5, 0.0, 0.0])
+    second = world.pose.copy()
+    second[4:] -= quaternion.to_matrix(world.pose[None, :4])[0] @ shift
+    # The poses see each landmark of theirs at the same pixel.
+    points = world.points3d, world.points3d + shift
+    matches = Matches(np.concatenate([world.points2d] * 2), np.concatenate(points))
+    poses = [world.pose, second]
+
+    def expected(best, used):
+        return Shown(9.0, 0.0, 1.0, *(30 * (nearest(best.pose) in known), 20.0))
+
+    def nearest(pose):
+        return int(np.argmin([np.linalg.norm(one[4:] - pose[4:]) for one in poses]))
+
+    found = pose_from_matches(CAMERA, matches, guided=lambda best: matches, expected=expected)
+    if len(known) == 1:
+        assert (found.status, nearest(found.cam_from_world)) == ("localized", known[0])
+    else:
+        assert found.status == "uncertain" and "Two places" in found.sentence
 
 
 def test_what_is_put_together_of_pieces_is_not_believed():
@@ -96,6 +124,37 @@ def test_what_is_put_together_of_pieces_is_not_believed():
     assert believed == ["localized"] * 5
 
 
+def test_a_place_is_known_beside_another_only_where_more_of_it_is_found():
+    """Eight of 5.5 are well above what other places have, and hardly more than 10 of 11."""
+    first, second = Shown(9.0, 0.0, found=10, expected=11.2), Shown(9.0, 0.0, found=12, expected=5.5)
+    assert second.known and not second.is_known_beside(first)
+    assert Shown(9.0, 0.0, found=22, expected=17.9).is_known_beside(Shown(9.0, 0.0, found=7, expected=23.3))
+    assert not Shown(9.0, 0.0).known and not Shown(9.0, 0.0).is_known_beside(first)
+
+
+def test_what_is_found_at_a_place_that_is_known_is_no_piece_of_another():
+    """The right half looks like what is beside it as well; near the pose what is there is found, or not."""
+    world = make_world(np.random.default_rng(12), points=300)
+    moved = world.points2d + np.array([0.0, 150.0])
+    matches = Matches(np.where(world.points2d[:, :1] > CAMERA.width / 2, moved, world.points2d), world.points3d)
+    rays = CAMERA.kind.unproject(CAMERA.params, np.ascontiguousarray(matches.points2d))
+    R = quaternion.to_matrix(world.pose[None, :4])[0]
+    at_the_place = Matches(matches.points2d, (rays / rays[:, 2:] * 5.0 - world.pose[4:]) @ R)
+    for near, telling, status in (
+        (at_the_place, 30, "localized"),
+        (matches, 30, "uncertain"),
+        (at_the_place, 5, "uncertain"),
+    ):
+        found = pose_from_matches(
+            CAMERA,
+            matches,
+            PoseOptions(look_for_rival=False),
+            guided=lambda best, near=near: near,
+            expected=lambda best, used, telling=telling: Shown(9.0, 0.0, 1.0, telling, 20.0),
+        )
+        assert found.status == status, found.sentence
+
+
 def test_cells_that_are_off_like_their_neighbours_are_counted():
     rng = np.random.default_rng(13)
     world = make_world(rng, points=300, lines=0)
@@ -106,7 +165,9 @@ def test_cells_that_are_off_like_their_neighbours_are_counted():
         pixels[rows] = rng.uniform((0, 0), (CAMERA.width, CAMERA.height), (wrong, 2))
         matches = Matches(pixels, world.points3d)
         found = fitted(CAMERA, matches, pose, (7.0, 7.0))
-        assert low <= cells_elsewhere(found, matches, 34.0) <= high
+        assert low <= cells_elsewhere(found, matches, 34.0, np.zeros((0, 2))) <= high
+        # Whatever shows the place is no piece of another.
+        assert cells_elsewhere(found, matches, 34.0, pixels) == 0
 
 
 def test_a_rival_needs_so_many_votes():

@@ -7,8 +7,9 @@ is found again in any photograph. How often, the map knows from its own images: 
 them see, and that its pose puts into it, it sees some itself, the more the more of the others do.
 
 Where a place repeats, another that looks like it shows what repeats in every part. What only this place has is missing
-there: points that look like no other (:mod:`groma.localization.repeated`). They are to be found about as often as all;
-few of them say little, so what counts is the lower limit of how often they are.
+there: points that tell it from others (:mod:`groma.localization.repeated`), found more like themselves than any other
+place of the map is. They are to be found about as often as all; few of them say little, so what counts is the lower
+limit of how often they are.
 """
 
 from __future__ import annotations
@@ -16,16 +17,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammaincinv
 
-from groma._typing import BoolArray, FloatArray, IntArray
-from groma.gates import NORMAL
+from groma._typing import FloatArray, IntArray
 from groma.localization.landmarks import counted_in
 from groma.localization.map_index import MapIndex
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.refinement import Refined
+from groma.localization.pose.verdict import Shown, at_least
+from groma.localization.repeated import GATES as REPEATED
 from groma.scene import Scene
 
 #: Images of a map that are asked how often points are found again, at most (cost: time).
@@ -58,7 +59,7 @@ class FoundAgain:
             rows = total[point] - itself[point] >= 2  # points that are in the map without this image
             camera = QueryCamera.of(scene.cameras, int(scene.images.camera_idx[image]))
             rows[rows] = camera.inside(camera.project(scene.cam_from_world[image], index.xyz[point[rows]]))
-            kind = index.unique[point[rows]].astype(np.int64), times[rows]
+            kind = (index.telling[point[rows]] >= REPEATED.alike).astype(np.int64), times[rows]
             np.add.at(asked, kind, 1.0)
             np.add.at(found, kind, itself[point[rows]])
         return FoundAgain(found / asked)
@@ -76,11 +77,10 @@ def shown_of(
     near: IntArray,
     best: Refined,
     matches: Matches,
-    found: IntArray,
+    found: tuple[IntArray, IntArray],
     lines: bool = True,
-) -> tuple[tuple[float, float], float]:
-    """Return how many parts of an image show what a pose puts there and how many show none of it; and how often what
-    only this place has is found at least, as a share of how often all of it is.
+) -> Shown:
+    """Return how much of what a pose puts into an image is there.
 
     Parts count by what is expected in them, points and lines alike.
 
@@ -91,7 +91,8 @@ def shown_of(
     near
         Its images near the photograph: what they see is expected.
     best, matches, found
-        The pose, what was looked for under it, and the points of the index that agree and are described alike.
+        The pose, what was looked for under it, and the points of the index that agree and are described alike; and
+        those that are described more alike than any other place.
     lines
         Whether lines were looked for.
     """
@@ -101,27 +102,19 @@ def shown_of(
     point, times = _seen_by(index, near)
     pixel = camera.project(best.pose, index.xyz[point])
     inside = camera.inside(pixel)
-    point, pixel, kind = point[inside], pixel[inside], index.unique[point[inside]]
-    rate = again.rate[kind.astype(np.int64), times[inside]]
+    point, pixel, telling = point[inside], pixel[inside], index.telling[point[inside]]
+    unique = telling >= REPEATED.alike
+    rate = again.rate[unique.astype(np.int64), times[inside]]
     expected = [(pixel, rate, VERDICT.expected)]
     if lines and scene.num_lines:
         rows = np.concatenate([np.arange(int(index.segment_begin[i]), int(index.segment_begin[i + 1])) for i in near])
         known = np.unique(scene.line_observations.line_idx[index.segment[rows]])
         expected.append((*_lengths(camera, best.pose, scene.lines.segments[known]), 0.5 * side))
-    often = _often_alone(rate, np.isin(point, found), kind, VERDICT.expected)
-    return _counted(camera, expected, shown, VERDICT.parts), often
-
-
-def _often_alone(rate: FloatArray, found: BoolArray, unique: BoolArray, least: float) -> float:
-    """How often unique points are found, as a share of how often all are; one where hardly any are expected.
-
-    It is the lower limit of the mean of a Poisson variable, at ``NORMAL.false_alarm`` (Garwood 1936).
-    """
-    often = min(1.0, float(found.sum()) / max(float(rate.sum()), 1e-12))
-    expected, count = often * float(rate[unique].sum()), int(found[unique].sum())
-    if expected < least:
-        return 1.0
-    return float(gammaincinv(count, NORMAL.false_alarm)) / expected if count else 0.0
+    parts = _counted(camera, expected, shown, VERDICT.parts)
+    alike, itself = (np.isin(point, some) for some in found)
+    often = min(1.0, float(alike.sum()) / max(float(rate.sum()), 1e-12))
+    alone = at_least(int(alike[unique].sum()), often * float(rate[unique].sum()))
+    return Shown(*parts, alone, int((itself & (telling > 0.0)).sum()), often * float(rate @ telling))
 
 
 def _counted(

@@ -43,6 +43,7 @@ from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.refinement import Refined
+from groma.localization.pose.verdict import Shown
 from groma.localization.repeated import GATES as REPEATED
 from groma.localization.repeated import Described, alike_limits
 from groma.localization.retrieval import VladRetrieval
@@ -242,30 +243,35 @@ class Localizer:
         """The pose from matches of a part of a query, those that it guides to, and what mirrored points match."""
         near = nearest_images(self.index, images, found.points[:, 1], self.options.gates.near)
         matches = found.matches(part, self.scene, self.index)
-        last, used = [found], [matches]
+        tried = [(matches, found)]
 
         def guided(best: Refined) -> Matches:
             reach = self._reach(query, best)
-            last[0] = found_near(
+            seen = found_near(
                 query, self.scene, self.index, near, best.camera, best.pose, (reach, reach), self.options.lines
             )
-            used[0] = last[0].matches(query, self.scene, self.index)
-            return used[0]
+            tried.append((seen.matches(query, self.scene, self.index), seen))
+            return tried[-1][0]
 
-        def closest(best: Refined, other: Refined) -> tuple[int, int]:
-            return closest_of(last[0].distance[best.point_inliers], mirror.distances(other, self._reach(query, best)))
+        def seen_in_them(used: Matches) -> Candidates:
+            return next(seen for made, seen in tried if made is used)
 
-        def expected(best: Refined) -> tuple[tuple[float, float], float]:
-            agreeing = last[0].points[best.point_inliers, 1]
+        def closest(best: Refined, used: Matches, other: Refined) -> tuple[int, int]:
+            distance = seen_in_them(used).distance[best.point_inliers]
+            return closest_of(distance, mirror.distances(other, self._reach(query, best)))
+
+        def expected(best: Refined, used: Matches) -> Shown:
+            agreeing = seen_in_them(used).points[best.point_inliers, 1]
+            distance = seen_in_them(used).distance[best.point_inliers]
             limit = self._alike_limits[self._landmarks.upright[agreeing].astype(np.int64)]
-            alike = agreeing[last[0].distance[best.point_inliers] <= limit]
+            alike = agreeing[distance <= limit], agreeing[distance <= self.index.within[agreeing]]
             around = nearest_images(self.index, images, agreeing, self.options.gates.near)
-            return shown_of(self.scene, self.index, self._again, around, best, used[0], alike, self.options.lines)
+            return shown_of(self.scene, self.index, self._again, around, best, used, alike, self.options.lines)
 
-        def common(best: Refined) -> FloatArray:
+        def common(best: Refined, used: Matches) -> FloatArray:
             if self._common is None:
                 return np.zeros((6, 6))
-            landmarks = last[0].points[:, 1], last[0].lines[:, 1]
+            landmarks = seen_in_them(used).points[:, 1], seen_in_them(used).lines[:, 1]
             return self._common.of_query(best, landmarks, self._own_camera(best.camera))
 
         mirror = MirrorImage(
@@ -274,7 +280,7 @@ class Localizer:
         )  # fmt: skip
         asked = MirrorQuestions(mirror.matches, closest)
         pose = pose_from_matches(camera, matches, options, max(len(images), 1), guided, asked, expected, enough, common)
-        return pose, last[0]
+        return pose, seen_in_them(pose.matches)
 
     def _own_camera(self, camera: QueryCamera) -> int | None:
         """The camera of the map with this very calibration."""

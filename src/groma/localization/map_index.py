@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from groma._typing import BoolArray, FloatArray, IntArray
+from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.fit import noise_of
@@ -36,7 +36,7 @@ from groma.localization.matching import lengths_of
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.records import landmark_covariances, residual_squares
-from groma.localization.repeated import Described, most_alike, unique_points
+from groma.localization.repeated import Described, most_alike, telling_points
 from groma.localization.retrieval import VladRetrieval
 from groma.localization.triangulation import triangulate_features
 from groma.mapping.lines.neighbors import covisible_neighbors
@@ -45,7 +45,7 @@ from groma.mapping.shown import check_points_shown
 from groma.scene import PointObservations, Points, Scene
 
 #: Of the format of the file; another one is built anew.
-_VERSION = 7
+_VERSION = 8
 #: Images that the features of an image are matched with (cost: time).
 _NEIGHBORS = 12
 
@@ -58,7 +58,8 @@ _FORMS = {
     **dict.fromkeys(("begin", "point", "segment_begin", "segment"), form("iu", None)),
     "pixel": form("f", None, 2), "descriptor": form("u", None, 128), "segment_descriptor": form("f", None, 72),
     "vocabulary": form("f", None, 128), "image": form("f", None, None),
-    "shared_error": form("f", 2), "unique": form("b", None), "common": form("f", None, None),
+    **dict.fromkeys(("within", "telling"), form("f", None)),
+    "shared_error": form("f", 2), "common": form("f", None, None),
     "point_seen": form("iu", None, 3), "point_motion": form("f", None, 3, None),
     "line_seen": form("iu", None, 3), "line_motion": form("f", None, 6, None),
 }  # fmt: skip
@@ -90,8 +91,10 @@ class MapIndex:
     #: (2,) what landmarks in one part of an image are off by together, radians as seen from it: where poses come from
     #: points alone, and from points and lines.
     shared_error: FloatArray = field(default_factory=lambda: np.zeros(2))
-    #: (P,) points that look like no other place in the images that see them; where repeated things are, the others.
-    unique: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
+    #: (P,) how far the descriptor of a view that shows a point, and no other place, is from its own; and the share of
+    #: its views that are so near, zero where it does not tell places apart.
+    within: FloatArray = field(default_factory=lambda: np.zeros(0))
+    telling: FloatArray = field(default_factory=lambda: np.zeros(0))
     #: (n, n) covariance of the poses and calibrations of the map; none where they are exact, or not determined. For
     #: each observation of points and of lines: landmark, frame and camera (., 3), and how the landmark follows these.
     common: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
@@ -123,7 +126,7 @@ class MapIndex:
         return (
             len(self.pixel) == len(self.descriptor) == count
             and len(self.segment_descriptor) == len(self.segment)
-            and len(self.point_covariance) == len(self.unique) == len(self.xyz)
+            and len(self.point_covariance) == len(self.within) == len(self.telling) == len(self.xyz)
             and len(self.segment_begin) - 1 == len(self.image) == images
             and self.image.shape[1] == 128 * len(self.vocabulary)
             and _divides(self.begin, count)
@@ -243,7 +246,7 @@ def build_index(
         camera = QueryCamera.of(scene.cameras, int(scene.images.camera_idx[image]))
         return camera.project(scene.cam_from_world[image], xyz[point])
 
-    unique = unique_points(described, begin, _longer_sides(scene), most_alike(images), seen_at, len(xyz))
+    within, telling = telling_points(described, begin, _longer_sides(scene), most_alike(images), seen_at, len(xyz))
     index = MapIndex(
         xyz,
         np.concatenate([made.covariance, np.nan_to_num(own_covariance)]),
@@ -255,7 +258,8 @@ def build_index(
         np.concatenate([one.segment_descriptors for one in found]),
         retrieval.vocabulary,
         images,
-        unique=unique,
+        within=within,
+        telling=telling,
     )
     sigma = np.concatenate(sigmas)
     index, difference = _with_common_errors(scene, index, sigma, (own_noise, line_noise), estimated)

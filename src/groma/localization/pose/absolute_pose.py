@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +26,7 @@ from groma.localization.pose.pieces import cells_elsewhere
 from groma.localization.pose.refinement import Refined, cells_of, fitted_at, refine
 from groma.localization.pose.verdict import (
     Evidence,
+    Shown,
     Status,
     Verdict,
     doubted_if_in_pieces,
@@ -33,6 +35,7 @@ from groma.localization.pose.verdict import (
     doubted_if_other_lens,
     doubted_if_repeated,
     evidence_of,
+    fits_as_well,
     judge,
     median_distance,
     most_votes,
@@ -76,7 +79,16 @@ class MirrorQuestions:
     #: Its matches, by each so many-th point.
     matches: Callable[[int], Matches]
     #: Of the most alike matches with a pose of the photograph, and with one of its mirror image: how many are of each.
-    closest: Callable[[Refined, Refined], tuple[int, int]]
+    closest: Callable[[Refined, Matches, Refined], tuple[int, int]]
+
+
+class _Place(NamedTuple):
+    """A pose: fitted to all that is near, and at that pose fitted to what was matched without it."""
+
+    best: Refined
+    used: Matches
+    own: Refined
+    evidence: Evidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,9 +207,9 @@ def pose_from_matches(
     places: int = 1,
     guided: Callable[[Refined], Matches] | None = None,
     mirror: MirrorQuestions | None = None,
-    expected: Callable[[Refined], tuple[tuple[float, float], float]] | None = None,
+    expected: Callable[[Refined, Matches], Shown] | None = None,
     enough: int = 0,
-    common: Callable[[Refined], FloatArray] | None = None,
+    common: Callable[[Refined, Matches], FloatArray] | None = None,
 ) -> AbsolutePose:
     """Estimate a pose as :func:`estimate_absolute_pose` does.
 
@@ -213,8 +225,7 @@ def pose_from_matches(
     mirror : MirrorQuestions, optional
         What is asked of the mirror image of the photograph.
     expected : callable, optional
-        Returns how many parts of the image show what a pose puts there, and how many show none of it; and how often
-        what only this place has is found, as a share of how often all of it is.
+        Returns how much of what a pose puts into the image is there. What only one place has decides between two.
     enough
         A pose with fewer votes is of no interest: it is ``failed``, without asking what else speaks against it.
     common : callable, optional
@@ -225,33 +236,55 @@ def pose_from_matches(
     if best is None:
         return _failed(camera, matches)
     first = evidence_of(best, matches, places)
-    own = best
-    rival_of = (best, first) if options.look_for_rival and first.significant else None
-    used = matches
-    if guided is not None and first.significant:
-        used, lens = guided(best), options.lens_of(camera)
+
+    def near(start: Refined) -> _Place:
+        assert guided is not None
+        used, lens = guided(start), options.lens_of(camera)
         errors = _errors(used, options)
-        best = refine(best.camera, used, best.pose, errors, lens, gathered=True)
-        own = fitted_at(own.one.at(best.pose, best.camera.params), best.camera, matches, errors, lens)
-        first = evidence_of(own, matches, places)
-    if first.agree < enough:
+        whole = refine(start.camera, used, start.pose, errors, lens, gathered=True)
+        own = fitted_at(best.one.at(whole.pose, whole.camera.params), whole.camera, matches, errors, lens)
+        return _Place(whole, used, own, evidence_of(own, matches, places))
+
+    here = near(best) if guided is not None and first.significant else _Place(best, matches, best, first)
+    if here.evidence.agree < enough:
         return _failed(camera, matches)
-    other = None if rival_of is None else _rival(matches, rival_of[0], options, places, rival_of[1])
+    other = _rival(matches, best, options, places, first) if options.look_for_rival and first.significant else None
+    rival = None if other is None else other[1]
+    if guided is not None and expected is not None and other is not None and fits_as_well(here.evidence, rival):
+        there = near(other[0])
+        one, two = (expected(place.best, place.used) for place in (here, there))
+        rival = None if one.is_known_beside(two) or two.is_known_beside(one) else rival
+        if two.is_known_beside(one):
+            here, other = there, (best, first)
+    return _judged(here, matches, options, (other, rival), mirror, expected, common)
+
+
+def _judged(
+    here: _Place,
+    matches: Matches,
+    options: PoseOptions,
+    other: tuple[tuple[Refined, Evidence] | None, Evidence | None],
+    mirror: MirrorQuestions | None,
+    expected: Callable[[Refined, Matches], Shown] | None,
+    common: Callable[[Refined, Matches], FloatArray] | None,
+) -> AbsolutePose:
+    """A pose and what is said of it; of another place, as evidence what is not decided already."""
+    best, used, first = here.best, here.used, here.evidence
     covariance = best.covariance(used)
     if common is not None and np.isfinite(covariance).all():
-        covariance = covariance + common(best)
-    distance = median_distance(best.pose, _seen(used, best))
-    verdict = judge(best, covariance, distance, first, None if other is None else other[1])
+        covariance = covariance + common(best, used)
+    verdict = judge(best, covariance, median_distance(best.pose, _seen(used, best)), first, other[1])
     supported = verdict.status == "localized"
-    if verdict.status == "localized":
-        elsewhere = cells_elsewhere(own, matches, VERDICT.distinct * max_errors(matches)[0])
+    shown = expected(best, used) if expected is not None and supported else Shown(0.0, 0.0)
+    if supported:
+        there = used.points2d[best.point_inliers & shown.known]
+        elsewhere = cells_elsewhere(here.own, matches, VERDICT.distinct * max_errors(matches)[0], there)
         verdict = doubted_if_in_pieces(verdict, first.agree, elsewhere)
         supported = verdict.status == "localized" or elsewhere > first.agree
-    if expected is not None and verdict.status == "localized":
-        parts, alone = expected(best)
-        verdict = doubted_if_repeated(doubted_if_missing(verdict, *parts), alone)
+    if verdict.status == "localized":
+        verdict = doubted_if_repeated(doubted_if_missing(verdict, shown.parts, shown.missing), shown)
     if mirror is not None and verdict.status == "localized":
-        verdict = _unless_mirrored(verdict, best, own, mirror, matches, options)
+        verdict = _unless_mirrored(verdict, here, mirror, matches, options)
     if not options.refine_lens and verdict.status == "localized":
         verdict = doubted_if_other_lens(verdict, lens_step(best, used, _errors(used, options)))
     failed = verdict.status == "failed"
@@ -266,13 +299,13 @@ def pose_from_matches(
         best.camera,
         used,
         best.sigma0,
-        None if other is None or verdict.status != "uncertain" else other[0].pose,
+        None if other[0] is None or verdict.status != "uncertain" else other[0][0].pose,
         supported and verdict.status != "localized",
     )
 
 
 def _unless_mirrored(
-    verdict: Verdict, best: Refined, own: Refined, mirror: MirrorQuestions, matches: Matches, options: PoseOptions
+    verdict: Verdict, here: _Place, mirror: MirrorQuestions, matches: Matches, options: PoseOptions
 ) -> Verdict:
     """Return a verdict, or another one where the mirror image of a photograph fits about as well, and by matches that
     are more alike.
@@ -280,23 +313,23 @@ def _unless_mirrored(
     Some of its points are matched first: mostly far too few of them agree with any pose.
     """
     points = matches.take(np.ones(matches.num_points, bool), np.zeros(matches.num_lines, bool))
-    agree = len(np.unique(cells_of(points.points2d, own.camera, VERDICT.cells)[own.point_inliers]))
+    agree = len(np.unique(cells_of(points.points2d, here.own.camera, VERDICT.cells)[here.own.point_inliers]))
     wanted = votes_of_a_rival(agree)
     parts = [(step, votes_of_a_part(wanted, 1.0 / step)) for step in _SOME]
     step, votes = next((one for one in parts if one[1] >= _VOTES), parts[-1])
     if votes:
         some = mirror.matches(step)
-        other = _best_of_others(own.camera, some, options, votes)
+        other = _best_of_others(here.own.camera, some, options, votes)
         if other is None or evidence_of(other, some).agree < votes:
             return verdict
     every = mirror.matches(1)
-    other = _best_of_others(own.camera, every, options, wanted)
+    other = _best_of_others(here.own.camera, every, options, wanted)
     if other is None:
         return verdict
     evidence = evidence_of(other, every)
     if not evidence.significant or evidence.agree < wanted:
         return verdict
-    return doubted_if_mirrored(verdict, *mirror.closest(best, other))
+    return doubted_if_mirrored(verdict, *mirror.closest(here.best, here.used, other))
 
 
 def _errors(matches: Matches, options: PoseOptions) -> tuple[float, float]:
@@ -308,8 +341,7 @@ def _best_of_others(camera: QueryCamera, matches: Matches, options: PoseOptions,
     possible = most_votes(matches, camera)
     if possible < max(votes, 1):
         return None
-    only_this = replace(options, refine_lens=False, focal_factors=(1.0,))
-    return _best(camera, matches, only_this, votes / possible, votes)
+    return _best(camera, matches, replace(options, refine_lens=False, focal_factors=(1.0,)), votes / possible, votes)
 
 
 def _best(

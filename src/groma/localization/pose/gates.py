@@ -53,6 +53,10 @@ class VerdictGates:
         0.25, "share", "of how often all points are found, that unique ones are found at least",
         "chosen on rendered facades: what is found in another place that looks like this one",
     )  # fmt: skip
+    known: float = gate(
+        0.6, "share", "of the same, of telling ones, where they decide for a place",
+        "chosen on five rendered facades: up to 0.53 in other places",
+    )  # fmt: skip
     focal: float = gate(0.01, "share", "of the focal length: a step that tells another lens", "convention: a hundredth")
     shift: float = gate(
         0.05, "focal lengths", "of an estimated principal point from the one that was given, if it is to be told",

@@ -16,7 +16,7 @@ from groma.localization.pose.matches import Matches
 from groma.localization.pose.refinement import Refined, cells_of
 
 
-def cells_elsewhere(refined: Refined, matches: Matches, beyond: float) -> int:
+def cells_elsewhere(refined: Refined, matches: Matches, beyond: float, there: FloatArray) -> int:
     """Return how many cells of an image show the map elsewhere than a pose says, each like a cell beside it.
 
     Parameters
@@ -25,12 +25,15 @@ def cells_elsewhere(refined: Refined, matches: Matches, beyond: float) -> int:
         The pose, and all that may be seen.
     beyond
         Matches that are off by less, pixels, do not disagree for sure.
+    there : (n, 2)
+        Pixels that show the place, whatever else looks like it.
     """
     camera = refined.camera
-    cell = cells_of(matches.points2d, camera, VERDICT.cells)
+    both = cells_of(np.concatenate([matches.points2d, there]), camera, VERDICT.cells)
+    cell, shown = both[: matches.num_points], both[matches.num_points :]
     expected = camera.project(refined.pose, matches.points3d)
     off = matches.points2d - expected
-    agreeing = np.unique(cell[refined.point_inliers])
+    agreeing = np.concatenate([cell[refined.point_inliers], shown])
     with np.errstate(invalid="ignore"):
         rows = np.flatnonzero((np.linalg.norm(off, axis=1) > beyond) & ~np.isin(cell, agreeing))
     if len(rows) < 2:

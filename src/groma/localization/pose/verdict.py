@@ -18,8 +18,9 @@ fall to either with the same probability; the first is the right one with the pr
 
 **The rest of the image.** What is to be seen under the pose is counted part by part of the image, by how often the map
 finds it again in its own images (:mod:`groma.localization.expected`). Where about as much is missing as is there, by
-the same test, a piece of the place is shown, or something that is like it. So it is with points that look like no other
-place of the map: where what repeats is found and they are not, another place that looks like this one is shown.
+the same test, a piece of the place is shown, or something that is like it. So it is with points that are told from all
+other places of the map: where what repeats is found and they are not, another place that looks like this one is shown.
+Where they are found, this place is shown, though others fit as well, and parts that are there would fit elsewhere, too.
 
 Reference: L. Moisan, B. Stival, *A probabilistic criterion to detect rigid point matches between two images and
 estimate the fundamental matrix*, 2004, eq. (9), for samples of three.
@@ -29,7 +30,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -70,6 +71,45 @@ class Verdict:
     #: That the place is right.
     probability: float
     sentence: str
+
+
+class Shown(NamedTuple):
+    """How much of what a pose says is in an image is there."""
+
+    #: Parts of the image that show something of it, and that show nothing.
+    parts: float
+    missing: float
+    #: How often points that look like no other place are found at least, as a share of how often all are; NaN where the
+    #: place has no such points.
+    alone: float = math.nan
+    #: How many points that tell the place from others are found, and how many are expected.
+    found: int = 0
+    expected: float = 0.0
+
+    @property
+    def known(self) -> bool:
+        """Whether what only this place has is surely there."""
+        return at_least(self.found, self.expected) >= VERDICT.known
+
+    def is_known_beside(self, other: Shown) -> bool:
+        """Whether what only this place has is surely there, and more often than what only another has is."""
+        from scipy.special import bdtrc
+
+        share = self.expected / max(self.expected + other.expected, 1e-12)
+        chance = bdtrc(self.found - 1, self.found + other.found, share) if self.found else 1.0
+        return self.known and chance <= NORMAL.false_alarm
+
+
+def at_least(found: int, expected: float) -> float:
+    """How much of what is expected is there at least; NaN where that is hardly anything.
+
+    It is the lower limit of the mean of a Poisson variable, at ``NORMAL.false_alarm`` (Garwood 1936).
+    """
+    from scipy.special import gammaincinv
+
+    if expected < VERDICT.expected:
+        return math.nan
+    return float(gammaincinv(found, NORMAL.false_alarm)) / expected if found else 0.0
 
 
 def evidence_of(refined: Refined, matches: Matches, places: int = 1) -> Evidence:
@@ -116,7 +156,7 @@ def judge(
         return Verdict(
             "failed", probability, f"No pose: only {agree} agree with the best one, as may happen by chance."
         )
-    if rival > 1.0 - VERDICT.right and second is not None:
+    if second is not None and fits_as_well(first, second):
         return Verdict(
             "uncertain",
             probability,
@@ -135,6 +175,11 @@ def judge(
     ):
         return Verdict("uncertain", probability, f"{agree} agree, but they do not determine the pose: {_open(sigma)}.")
     return Verdict("localized", probability, f"{agree} agree.")
+
+
+def fits_as_well(first: Evidence, second: Evidence | None) -> bool:
+    """Whether another place fits about as well."""
+    return _as_good(first, second) > 1.0 - VERDICT.right
 
 
 def doubted_if_mirrored(verdict: Verdict, own: int, mirror: int) -> Verdict:
@@ -179,17 +224,16 @@ def doubted_if_missing(verdict: Verdict, shown: float, missing: float) -> Verdic
     return Verdict("uncertain", 1.0 - VERDICT.right, words)
 
 
-def doubted_if_repeated(verdict: Verdict, often: float) -> Verdict:
+def doubted_if_repeated(verdict: Verdict, shown: Shown) -> Verdict:
     """Return a verdict, or ``uncertain`` where what only this place has is not surely found.
 
-    ``often`` is how often points that look like no other are found at least, as a share of how often all points are:
-    about one in this place, a few by chance in another that looks like it.
+    That is where points that look like no other may be missing, and those that tell it from others are too few.
     """
-    if verdict.status != "localized" or often >= VERDICT.alone:
+    if verdict.status != "localized" or shown.known or not shown.alone < VERDICT.alone:
         return verdict
     words = (
-        f"{verdict.sentence} But points that look like no other place may be found only {100 * often:.0f} % as often "
-        "as all: the photograph may show another place that looks like this one."
+        f"{verdict.sentence} But points that look like no other place may be found only {100 * shown.alone:.0f} % as "
+        "often as all: the photograph may show another place that looks like this one."
     )
     return Verdict("uncertain", 1.0 - VERDICT.right, words)
 
