@@ -26,7 +26,7 @@ from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.refinement import Refined
 from groma.localization.pose.verdict import Shown, at_least
-from groma.localization.repeated import GATES as REPEATED
+from groma.localization.repeated import ALIKE
 from groma.scene import Scene
 
 #: Images of a map that are asked how often points are found again, at most (cost: time).
@@ -59,7 +59,7 @@ class FoundAgain:
             rows = total[point] - itself[point] >= 2  # points that are in the map without this image
             camera = QueryCamera.of(scene.cameras, int(scene.images.camera_idx[image]))
             rows[rows] = camera.inside(camera.project(scene.cam_from_world[image], index.xyz[point[rows]]))
-            kind = (index.telling[point[rows]] >= REPEATED.alike).astype(np.int64), times[rows]
+            kind = (index.telling[point[rows]] >= ALIKE).astype(np.int64), times[rows]
             np.add.at(asked, kind, 1.0)
             np.add.at(found, kind, itself[point[rows]])
         return FoundAgain(found / asked)
@@ -103,7 +103,7 @@ def shown_of(
     pixel = camera.project(best.pose, index.xyz[point])
     inside = camera.inside(pixel)
     point, pixel, telling = point[inside], pixel[inside], index.telling[point[inside]]
-    unique = telling >= REPEATED.alike
+    unique = telling >= ALIKE
     rate = again.rate[unique.astype(np.int64), times[inside]]
     expected = [(pixel, rate, VERDICT.expected)]
     if lines and scene.num_lines:

@@ -39,7 +39,7 @@ class RepeatedGates:
 
 GATES = RepeatedGates()
 #: Quantile of distances of one point: nearer ones look alike (derived from the share that is left out).
-_ALIKE = 1.0 - NORMAL.significance
+ALIKE = 1.0 - NORMAL.significance
 
 
 class Described(NamedTuple):
@@ -90,7 +90,7 @@ def telling_points(
         Number of points.
     """
     same = [_same(described, upright) for upright in (False, True)]
-    few, most = (np.array([_quantile(far, share) for far in same]) for share in (GATES.telling, _ALIKE))
+    few, most = (np.array([_quantile(far, share) for far in same]) for share in (GATES.telling, ALIKE))
     kind = described.upright.astype(np.int64)
 
     def elsewhere(image: int) -> FloatArray:
@@ -119,7 +119,7 @@ def telling_points(
     for upright, far in enumerate(same):
         point = np.unique(described.point[kind == upright])
         near = np.searchsorted(far, within[point], "right") / max(len(far), 1)
-        share[point] = np.where(within[point] < most[int(upright)], near, _ALIKE)
+        share[point] = np.where(within[point] < most[int(upright)], near, ALIKE)
     return Telling(within, np.where(share > GATES.telling, share, 0.0))
 
 
@@ -135,7 +135,7 @@ def alike_limits(described: Described) -> FloatArray:
 
     Parameters are those of :func:`telling_points`.
     """
-    return np.array([_quantile(_same(described, upright), _ALIKE) for upright in (False, True)])
+    return np.array([_quantile(_same(described, upright), ALIKE) for upright in (False, True)])
 
 
 def _same(described: Described, upright: bool) -> FloatArray:
