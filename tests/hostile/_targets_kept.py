@@ -116,14 +116,13 @@ def _maps(work: Path) -> Iterator[Made]:
     shapes = {
         "xyz": (4, 3), "point_covariance": (4, 3, 3), "pixel": (5, 2), "line_covariance": (2, 6, 6),
         "segment_descriptor": (5, 72), "vocabulary": (2, 128), "image": (2, 256), "shared_error": (2,),
-        "common": (8, 8), "point_motion": (3, 3, 8), "line_motion": (2, 6, 8),
+        "within": (4,), "telling": (4,), "common": (8, 8), "point_motion": (3, 3, 8), "line_motion": (2, 6, 8),
     }  # fmt: skip
     arrays = {name: rng.uniform(0.0, 9.0, shape) for name, shape in shapes.items()}
     for name in ("segment_descriptor", "vocabulary", "image", "point_motion", "line_motion"):
         arrays[name] = arrays[name].astype(np.float32)
     arrays |= {"begin": count, "segment_begin": count, "point": np.arange(5) % 4, "segment": np.arange(5) % 2}
     arrays["descriptor"] = rng.integers(0, 255, (5, 128)).astype(np.uint8)
-    arrays["unique"] = np.arange(4) < 2
     arrays |= {"point_seen": np.array([[0, 0, 0], [1, 0, 0], [3, 0, 0]]), "line_seen": np.array([[0, 0, 0], [1, 0, 0]])}
     index = MapIndex(**{item.name: arrays[item.name] for item in fields(MapIndex)})
     index.write(work / "i.npz", "digest", work)
