@@ -182,6 +182,18 @@ def test_a_track_that_is_ended_early_has_what_there_is(sequence, how):
     assert len(result.frames) == len(result.trajectory) == 6
 
 
+def test_a_track_interrupted_before_its_first_pose_is_interrupted(sequence, tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Tracker, "process", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        groma.track(groma.open_sequence(sequence, camera=CAMERA))
+    said = _run(sequence, "-o", tmp_path / "out", "--camera", CAMERA)
+    assert said.exit_code == 130 and "interrupted" in said.output
+    assert not (tmp_path / "out").exists()
+
+
 #: ``groma track`` that kills itself in the middle of a frame.
 KILLED = """
 import os, signal, sys

@@ -168,7 +168,7 @@ def track(
     options : TrackOptions, optional
         How to track.
     progress : callable, optional
-        Called after every frame; return False to end the track there. Ctrl-C does the same.
+        Called after every frame; return False to end the track there. Ctrl-C does the same once a frame has a pose.
     work : path, optional
         Folder for finished keyframes during the track (``groma view --live``); replaced.
     name : str
@@ -291,6 +291,8 @@ def _follow(
                     journal.begin_anew()
                 return _follow(better, sequence, frames, progress, journal)
     except KeyboardInterrupt:
+        if all(frame.pose is None for frame in frames):
+            raise  # nothing was tracked yet that could be returned
         return tracker, False
     return tracker, True
 
