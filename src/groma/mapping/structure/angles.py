@@ -216,7 +216,7 @@ def right_angles(
     for k in np.unique(family[kept]):
         rows = kept[(family[kept] == k) & telling[kept]]
         deviation[k] = _upper_end(offset[rows][axes[rows]] ** 2, variance[rows][axes[rows]], per_vector, gates)
-    sigma = deviation[family[kept]] * np.sqrt(np.maximum(0.5 * times[found[kept]].mean(axis=1), 1.0))
+    sigma = deviation[family[kept]] * np.sqrt(np.maximum(0.25 * times[found[kept]].sum(axis=1), 1.0))
     return Angles(found[kept], right[kept], told.probability[kept], sigma)
 
 
