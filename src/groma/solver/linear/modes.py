@@ -65,7 +65,7 @@ def smallest(layout: Layout, fronts: Fronts, S: Blocks, count: int = MODES) -> M
     X = np.linalg.qr(np.random.default_rng(0).normal(size=(n, count)))[0]
     shift = SHIFT
     while not fronts.factorize(_shifted(layout, S, shift)):
-        shift *= 10.0
+        shift *= 10.0  # cost: accuracy, see above
         if shift > MAX_SHIFT:  # not a positive matrix at all: a degenerate linearisation
             return Modes(np.zeros(0), np.zeros((n, 0)))
     for _ in range(ROUNDS if count < n else 1):
