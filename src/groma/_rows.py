@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Values that are columns of equal length: choosing rows, putting rows together, none at all."""
+"""Values that are columns of equal length: choosing rows, putting rows together, numbering them, none at all."""
 
 from __future__ import annotations
 
@@ -11,6 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._typing import BoolArray, IntArray
+
+
+def numbered(count: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the group of each item, and its number in the group, of groups of some sizes one after the other."""
+    owner = np.repeat(np.arange(len(count)), count)
+    return owner, np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
 
 
 def column(*shape: int, dtype: npt.DTypeLike = np.float64) -> Any:

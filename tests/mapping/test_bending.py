@@ -34,7 +34,7 @@ def members(height, places, deviation=0.0, turn=None):
         np.zeros(num, int), np.zeros(0, int), [points],
     )  # fmt: skip
     on = Pairs(np.column_stack([np.arange(num), np.zeros(num, int)]), np.ones(num), np.full(num, deviation))
-    return marks, planes, on, Pairs.none()
+    return marks, planes, on, Pairs.empty()
 
 
 def places(num=200, half=(1.0, 0.6), seed=3):
@@ -100,7 +100,7 @@ def test_members_in_a_row_or_at_one_place_tell_nothing(at):
 
 def test_no_planes_and_a_plane_without_members():
     marks, planes, _, lines = members(np.zeros(50), places(50))
-    assert not bending(marks, planes, Pairs.none(), lines, LEVEL).any()
+    assert not bending(marks, planes, Pairs.empty(), lines, LEVEL).any()
     nothing, no_number, labels = np.zeros(0), np.zeros(0, int), (np.full(50, -1), np.zeros(0, int))
     none = PlaneSet(np.zeros((0, 4)), np.zeros((0, 4, 4)), no_number, nothing, nothing, nothing, *labels)
-    assert len(bending(marks, none, Pairs.none(), lines, LEVEL)) == 0
+    assert len(bending(marks, none, Pairs.empty(), lines, LEVEL)) == 0

@@ -77,7 +77,7 @@ def radial_limit(k1, k2):
     smallest = math.inf
     if q > 0.0:
         smallest = 1.0 / q
-    if k2 != 0.0 and q / (5.0 * k2) > 0.0:
+    if k2 != 0.0 and q / (5.0 * k2) > 0.0:  # derived from the derivative of k2 r^5
         smallest = min(smallest, q / (5.0 * k2))
     return math.sqrt(smallest)
 

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 #: How many processes, if the user says so; 0 for none.
 VARIABLE = "GROMA_COMPILE_PROCESSES"
+#: Most processes otherwise (cost: memory).
 _MOST = 8
 #: Whether a process that has imported everything can become several: half a second of work each. Elsewhere than on
 #: Linux, libraries of the system may not survive it.

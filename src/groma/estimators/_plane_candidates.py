@@ -141,7 +141,7 @@ def _through_neighbours(places, packed, neighbours, seed, choice, limit, rounds,
                     m0 += weight[k] * places[i, 0]
                     m1 += weight[k] * places[i, 1]
                     m2 += weight[k] * places[i, 2]
-            if enough < 4:
+            if enough < 4:  # derived from three that fix a plane
                 break
             c0, c1, c2 = m0 / total, m1 / total, m2 / total
             A[:] = 0.0

@@ -149,7 +149,7 @@ def _polished_loop(features, rows, band, gates, mark, layer, joined, numbers, pl
             if not abs(height[k]) < inlier * spread[k]:
                 weight[k] = 0.0
             positive += weight[k] > 0.0
-        if share < least_share or positive < 3:
+        if share < least_share or positive < 3:  # derived from three that fix a plane
             return 0, 0.0
         fit_loop(places, packed, layer[:count], weight, rounds, plane, center, density)
     return count, share

@@ -247,7 +247,7 @@ def connected_part_loop(places, spacing, partner, carrier, neighbours, rows, hel
     See :func:`linked_loop`. Fewer than three rows are one part with nothing in it.
     """
     number = len(rows)
-    if number < 3:
+    if number < 3:  # derived from three that fix a plane
         for k in range(number):
             out[k] = rows[k]
         return number, 0

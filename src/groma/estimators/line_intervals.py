@@ -19,6 +19,7 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._ordering import ascending, median, sort_by
+from groma._rows import numbered
 from groma._typing import FloatArray, IntArray
 from groma.estimators.line_ends import LINE_ENDS
 from groma.execution import map_ranges
@@ -147,6 +148,6 @@ def supported_intervals(
         _all_intervals(pointers[part.start : part.stop + 1], image, *columns, gates, begins, ends, count[part])
 
     map_ranges(fill, num_lines, _LINES_AT_ONCE)
-    line = np.repeat(np.arange(num_lines), count)
-    row = pointers[line] + np.arange(len(line)) - np.repeat(np.cumsum(count) - count, count)
+    line, number = numbered(count)
+    row = pointers[line] + number
     return line, np.column_stack([begins[row], ends[row]])

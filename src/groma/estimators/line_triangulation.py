@@ -181,7 +181,7 @@ def _linear(bundle: _Bundle, pair: str, min_sine: float) -> LineTriangulation:
     scatter = bundle.planes[:, :3, None] * bundle.planes[:, None, :3]  # without weights: a question of geometry only
     values = np.linalg.eigvalsh(sum_by_line(scatter, bundle.pointers)) / np.maximum(bundle.count, 1)[:, None]
     total = np.maximum(sum_by_line(bundle.weights**2, bundle.pointers), np.finfo(float).tiny)
-    sine = 2.0 * np.sqrt(np.clip(values[:, 1] * values[:, 2], 0.0, 0.25))
+    sine = 2.0 * np.sqrt(np.clip(values[:, 1] * values[:, 2], 0.0, 0.25))  # derived from eigenvalues that sum to 1
     local = np.where(finite[:, None], line, 0.0)
     foot = np.cross(local[:, 3:], local[:, :3])
     off = dot(bundle.planes[:, :3], foot[bundle.owner]) + bundle.planes[:, 3] / scale[bundle.owner]

@@ -153,7 +153,7 @@ def find_planes(
     labels = np.full(len(places), -1)
     say = progress or (lambda done, total: None)
     found: list[Grown] = []
-    if len(places) >= max(options.min_support, 4):
+    if len(places) >= max(options.min_support, 4):  # derived from three that fix a plane
         found = _extract(places, noise, partner, carrier, len(points), labels, options, say)
     fits = [grown.fit for grown in found]
     end_label = labels[len(points) :].reshape(-1, 2)

@@ -37,6 +37,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from groma._rows import numbered
 from groma._trees import kd_tree
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
@@ -202,8 +203,7 @@ def _near(segments: FloatArray, step: float, taus: list[float], target: Distance
 
 def places_on(segments: FloatArray, count: IntArray) -> tuple[FloatArray, IntArray]:
     """Return the midpoints (n, 3) of equal parts of each segment, and the segment of each."""
-    owner = np.repeat(np.arange(len(segments)), count)
-    inside = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
+    owner, inside = numbered(count)
     share = ((inside + 0.5) / count[owner])[:, None]
     return segments[owner, 0] * (1 - share) + segments[owner, 1] * share, owner
 

@@ -19,8 +19,10 @@ from groma.cameras import CameraModel, model
 from groma.errors import InputError, ShapeError
 from groma.factors._examples import make_example, visible_scene
 from groma.factors._rig import CameraFactor
-from groma.factors.contract import ANY_SIMILARITY, Example, Invariance, Ref
+from groma.factors.contract import ANY_SIMILARITY, Example, Invariance, Ref, Slot
 from groma.geometry.manifold import Euclidean
+
+INTRINSICS = Slot("intrinsics", "intrinsics")
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels

@@ -9,7 +9,7 @@ import numpy as np
 
 from groma._numba import kernel
 from groma._typing import FloatArray
-from groma.errors import ShapeError
+from groma.errors import InputError, ShapeError
 from groma.geometry import se3
 
 #: Squared angle below which coefficients come from their series, as the closed forms lose up to theta^-5 eps to
@@ -57,6 +57,33 @@ def as_rows(factor: Any, field: str, *shape: int) -> FloatArray:
 def set_rows(factor: Any, field: str, *shape: int) -> None:
     """Replace field ``field`` of a factor under construction by its checked form (see :func:`as_rows`)."""
     object.__setattr__(factor, field, as_rows(factor, field, *shape))
+
+
+def check_finite(factor: Any, field: str) -> None:
+    """Raise InputError unless all numbers of field ``field`` (N, ...) are finite."""
+    rows = getattr(factor, field)
+    finite = np.isfinite(rows).all(axis=tuple(range(1, rows.ndim)))
+    if not finite.all():
+        row = int(np.argmin(finite))
+        raise InputError(
+            f"{type(factor).__name__}.{field} must be finite; row {row} is {rows[row].tolist()} "
+            f"({np.count_nonzero(~finite)} such rows). Leave these observations out."
+        )
+
+
+def normalize_rows(factor: Any, field: str, size: int) -> None:
+    """Scale the rows of field ``field`` so that their first ``size`` numbers have norm one.
+
+    Rows that have it already, to rounding, keep their bits. Raises InputError for rows of norm zero, or infinite.
+    """
+    rows = getattr(factor, field)
+    norm = np.linalg.norm(rows[:, :size], axis=1)
+    for wrong, words in ((~np.isfinite(norm), "be finite; row {} is not"), (norm == 0.0, "not be zero; row {} is")):
+        if wrong.any():
+            told = words.format(int(np.argmax(wrong)))
+            raise InputError(f"{type(factor).__name__}.{field} must {told}. Leave these observations out.")
+    norm[np.abs(norm - 1.0) < 1e-15] = 1.0
+    object.__setattr__(factor, field, rows / norm[:, None])
 
 
 def poses_from_states(poses: FloatArray) -> FloatArray:

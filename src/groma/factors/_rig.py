@@ -19,14 +19,13 @@ from __future__ import annotations
 from abc import abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import Columns, FloatArray, Inputs, IntArray
 from groma.errors import InputError, ShapeError
-from groma.factors._record import set_rows
 from groma.factors._rolling import compose_rows, split_rows
 from groma.factors.contract import Factor, Ref, Slot
 from groma.geometry.se3 import compose_kernel
@@ -184,28 +183,11 @@ class CameraFactor(Factor):
     #: (N, 1) or (N, m) when in the readout, from -1/2 to 1/2, a factor or each row of its residual was seen; or None.
     offsets: FloatArray | None = None
 
-    #: Measured arrays: name of the field and length of a row, 0 for plain numbers. They are checked on construction.
-    measured: ClassVar[tuple[tuple[str, int], ...]] = ()
-
     def __post_init__(self) -> None:
-        """Check that all references and measurements have N rows, and that measurements are finite."""
-        for slot, ref in self.references():
-            if len(ref.index) != len(self):
-                raise ShapeError(
-                    f"{type(self).__name__}.{slot.name} must have one index per factor, {len(self)} like its "
-                    f"{self.slots[0].name}; got {len(ref.index)}."
-                )
+        """Check the offsets too."""
+        super().__post_init__()
         if self.motion is not None:
             self._check_offsets()
-        for field, size in self.measured:
-            set_rows(self, field, *([size] if size else []))
-            finite = np.isfinite(getattr(self, field)).reshape(len(self), max(size, 1)).all(axis=1)
-            if not finite.all():
-                row = int(np.argmin(finite))
-                raise InputError(
-                    f"{type(self).__name__}.{field} must be finite; row {row} is {getattr(self, field)[row].tolist()} "
-                    f"({np.count_nonzero(~finite)} such rows). Leave these observations out."
-                )
 
     def _check_offsets(self) -> None:
         offsets = np.ascontiguousarray(self.offsets, dtype=np.float64)
@@ -308,18 +290,3 @@ class CameraFactor(Factor):
         ``inputs`` are cam_from_world (M, 12), its index (N,), and the other ambient arrays; ``columns`` belong to all
         slots but the extrinsics. With a record of width one only the residual is written.
         """
-
-
-def normalize_rows(factor: Any, field: str, size: int) -> None:
-    """Scale the rows of field ``field`` so that their first ``size`` numbers have norm one.
-
-    Rows that have it already, to rounding, keep their bits. Raises InputError for rows that are zero or not finite.
-    """
-    rows = getattr(factor, field)
-    norm = np.linalg.norm(rows[:, :size], axis=1)
-    for wrong, words in ((~np.isfinite(norm), "be finite; row {} is not"), (norm == 0.0, "not be zero; row {} is")):
-        if wrong.any():
-            told = words.format(int(np.argmax(wrong)))
-            raise InputError(f"{type(factor).__name__}.{field} must {told}. Leave these observations out.")
-    norm[np.abs(norm - 1.0) < 1e-15] = 1.0
-    object.__setattr__(factor, field, rows / norm[:, None])

@@ -43,7 +43,7 @@ def _load_vector(flat, vector):
 def _move_pose(flat, k, h, pose):
     """Write (I + h G_k) T: translation along axis k < 3, or rotation about axis k - 3; return the size of the step."""
     _load_pose(flat, pose)
-    if k < 3:
+    if k < 3:  # derived from the order of a twist: translation first
         step = h * max(1.0, abs(flat[4 * k + 3]))
         pose[k, 3] += step
         return step

@@ -33,6 +33,7 @@ import numpy as np
 
 from groma._typing import Columns, FloatArray, Inputs, IntArray
 from groma.errors import ProblemError, ShapeError
+from groma.factors._record import check_finite, normalize_rows, set_rows
 from groma.factors.losses import Loss, Trivial
 from groma.geometry.manifold import Manifold
 
@@ -65,6 +66,18 @@ class Slot:
     optional: bool = False
     #: Whether the variable moves when the world moves. A camera's place on its rig does not, though it is a pose.
     in_world: bool = True
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A field of a factor type with an array of numbers for each factor, all finite."""
+
+    #: Name of the dataclass field, for example ``"pixels"``.
+    name: str
+    #: Shape of the numbers of one factor.
+    shape: tuple[int, ...]
+    #: The first so many of them are scaled to norm one on construction.
+    num_normalized: int = 0
 
 
 @dataclass(frozen=True)
@@ -102,6 +115,8 @@ class Factor(ABC):
     type_name: ClassVar[str] = ""
     #: The variables touched, in order.
     slots: ClassVar[tuple[Slot, ...]]
+    #: The arrays that are checked on construction.
+    measurements: ClassVar[tuple[Measurement, ...]] = ()
     #: Rows m of one residual; where they are not the same for all factors of a type, it overrides ``residual_size``.
     rows: ClassVar[int]
     #: How many of them are independent; 0: all.
@@ -111,6 +126,20 @@ class Factor(ABC):
     is_incidence: ClassVar[bool] = False
     #: Which motions of the world it does not notice; None: not declared, and not checked.
     invariance: ClassVar[Invariance | None] = Invariance()
+
+    def __post_init__(self) -> None:
+        """Check that all references and measurements have N rows, and that measurements are finite."""
+        for slot, ref in self.references():
+            if len(ref.index) != len(self):
+                raise ShapeError(
+                    f"{type(self).__name__}.{slot.name} must have one index per factor, {len(self)} like its "
+                    f"{self.references()[0][0].name}; got {len(ref.index)}."
+                )
+        for measurement in self.measurements:
+            set_rows(self, measurement.name, *measurement.shape)
+            check_finite(self, measurement.name)
+            if measurement.num_normalized:
+                normalize_rows(self, measurement.name, measurement.num_normalized)
 
     @property
     def residual_size(self) -> int:

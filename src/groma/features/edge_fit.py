@@ -89,7 +89,7 @@ def _peak(profile, window):
         rise = profile[k + 1] - profile[k]
         if rise > best:
             best, at = rise, k
-    if at < 1 or at > SAMPLES - 3:
+    if at < 1 or at > SAMPLES - 3:  # derived from the samples beside an ascent
         return math.nan
     center = at - REACH + 0.5
     for _ in range(4):

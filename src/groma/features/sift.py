@@ -149,6 +149,6 @@ def _blobs(found: Sequence[cv2.KeyPoint], described: npt.NDArray[np.float32] | N
         np.array([one.pt for one in found], np.float64) + 0.5,
         np.array([one.size for one in found], np.float64),
         np.array([one.response for one in found], np.float64),
-        np.where(octave > 127, octave - 256, octave),
+        np.where(octave > 127, octave - 256, octave),  # derived from a byte with a sign
         described,
     )

@@ -61,9 +61,10 @@ def gauge_directions(
     moved = np.empty((len(state), manifold.factor_columns, 7))
     for k in range(7):
         a, rotation, scale = np.zeros(3), np.zeros(3), float(k == 6)
+        # derived from three translations, three rotations and a scale
         if k < 3:
             a[k] = length
-        elif k < 6:
+        elif k < 6:  # derived from the same
             rotation[k - 3] = 1.0
         a = a - np.cross(rotation, center) - scale * center
         moved[:, :, k] = _coordinate_motion(manifold.kind, ambient, a, rotation, scale)

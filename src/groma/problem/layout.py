@@ -20,8 +20,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from groma._typing import IntArray
 from groma.factors.contract import Factor
@@ -42,6 +45,11 @@ class Member:
     #: Block of each variable; None if variable i is in block i.
     block_of: IntArray | None = None
 
+    @property
+    def columns(self) -> slice:
+        """Columns of this variable inside the block."""
+        return slice(self.offset, self.offset + self.dof)
+
     def blocks(self, index: IntArray) -> IntArray:
         """Return the block of each variable in ``index``."""
         return index if self.block_of is None else self.block_of[index]
@@ -56,6 +64,15 @@ class KeptClass:
     members: tuple[Member, ...]
     #: Position of the first unknown of this class in the reduced system.
     start: int
+
+    @property
+    def unknowns(self) -> slice:
+        """Where the unknowns of this class are in the reduced system."""
+        return slice(self.start, self.start + self.count * self.width)
+
+    def blocks_of(self, x: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Return the part of a vector, or of columns, (unknowns, ...) as (count, width, ...), without a copy."""
+        return x[self.unknowns].reshape(self.count, self.width, *x.shape[1:])
 
 
 @dataclass(frozen=True)
@@ -174,6 +191,21 @@ class Layout:
     def num_kept_unknowns(self) -> int:
         """Size of the reduced system."""
         return sum(c.width * c.count for c in self.kept)
+
+    @property
+    def kinds(self) -> list[str]:
+        """Kind of each kept class: that of its first member."""
+        return [self.problem.variables[c.members[0].group].manifold.kind for c in self.kept]
+
+    @cached_property
+    def unknowns(self) -> dict[str, IntArray]:
+        """Where the coordinates (count, dof) of the kept variables of each group are in the reduced system."""
+        found = {}
+        for kept in self.kept:
+            for member in kept.members:
+                blocks = member.blocks(np.arange(len(self.problem.variables[member.group])))
+                found[member.group] = kept.start + member.offset + blocks[:, None] * kept.width + np.arange(member.dof)
+        return found
 
 
 def in_runs(chunks: Iterable[Chunk], most: int) -> Iterator[list[Chunk]]:

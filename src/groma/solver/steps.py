@@ -110,7 +110,7 @@ def parts_of(layout: Layout, step: Step) -> Iterator[tuple[Manifold, str, FloatA
     for kept, delta in zip(layout.kept, step.kept, strict=True):
         blocks = delta.reshape(kept.count, kept.width)
         for member in kept.members:
-            part = blocks[:, member.offset : member.offset + member.dof]
+            part = blocks[:, member.columns]
             if member.block_of is not None:
                 part = part[member.block_of]
             yield variables[member.group].manifold, member.group, np.ascontiguousarray(part)

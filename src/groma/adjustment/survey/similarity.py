@@ -121,7 +121,7 @@ def _fitted(source: FloatArray, target: FloatArray) -> RobustSimilarity:
 
 
 def _triples(count: int):
-    if comb(count, 3) <= GATES.draws:
+    if comb(count, 3) <= GATES.draws:  # derived from three points that fix a similarity
         return [np.array(rows) for rows in combinations(range(count), 3)]
     random = np.random.default_rng(0)
     return [random.choice(count, 3, replace=False) for _ in range(GATES.draws)]

@@ -62,7 +62,7 @@ def check_places(source: FloatArray, target: FloatArray, fit: RobustSimilarity, 
     """
     if len(source) < 5:
         return
-    if min(positions, control) >= 3:
+    if min(positions, control) >= 3:  # derived from three points that fix a similarity
         first, last = slice(0, positions), slice(len(source) - control, None)
         try:
             scales = [robust_similarity(source[rows], target[rows]).similarity.scale for rows in (first, last)]

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from groma._rows import numbered
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.terms.contract import Draft, Group, Term
 from groma.adjustment.terms.relations import metric_rows
@@ -130,9 +131,7 @@ def _join(landmark: IntArray, relation: IntArray, count: int) -> tuple[IntArray,
     first = np.searchsorted(landmark[order], np.arange(count))
     number = np.bincount(landmark, minlength=count)
     of_relation = relation[:, 0] if len(relation) else np.zeros(0, np.int64)
-    repeats = number[of_relation]
-    owner = np.repeat(np.arange(len(of_relation)), repeats)
-    within = np.arange(len(owner)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
+    owner, within = numbered(number[of_relation])
     observation = order[first[of_relation[owner]] + within] if len(owner) else np.zeros(0, np.int64)
     return observation, (relation[owner, 1] if len(owner) else np.zeros(0, np.int64))
 

@@ -42,7 +42,7 @@ def poses(
         console.warn(
             f"{missing} of the reference {'is' if scores.num_missing == 1 else 'are'} missing in the estimate."
         )
-    if scores.num_images < 3:
+    if scores.num_images < 3:  # derived from three points that fix a similarity
         console.warn("The alignment takes the centres of one or two images onto each other, whatever their poses.")
     rows = [
         ["camera centres, units of the reference", f"{scores.center_rmse:.4g}", "", ""],

@@ -36,12 +36,11 @@ from groma.factors._rig import (
     POSE,
     CameraFactor,
     clear_record,
-    normalize_rows,
     put_line,
     put_line_pose,
     transform_line,
 )
-from groma.factors.contract import ANY_SIMILARITY, Example, Invariance, Ref, Slot, register
+from groma.factors.contract import ANY_SIMILARITY, Example, Invariance, Measurement, Ref, Slot, register
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -99,13 +98,10 @@ class LineBearing(CameraFactor):
 
     slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("line", "line"), EXTRINSICS, MOTION)
     invariance: ClassVar[Invariance] = ANY_SIMILARITY
-    measured: ClassVar[tuple[tuple[str, int], ...]] = (("start_bearings", 3), ("end_bearings", 3))
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        normalize_rows(self, "start_bearings", 3)
-        normalize_rows(self, "end_bearings", 3)
-
+    measurements: ClassVar[tuple[Measurement, ...]] = (
+        Measurement("start_bearings", (3,), num_normalized=3),
+        Measurement("end_bearings", (3,), num_normalized=3),
+    )
     rows: ClassVar[int] = 2
 
     def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102

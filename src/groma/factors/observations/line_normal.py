@@ -34,8 +34,8 @@ from groma._numba import kernel, loop
 from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices, make_example, visible_scene
 from groma.factors._record import put_block, put_residual
-from groma.factors._rig import EXTRINSICS, POSE, CameraFactor, normalize_rows
-from groma.factors.contract import Example, Invariance, Ref, Slot, register
+from groma.factors._rig import EXTRINSICS, POSE, CameraFactor
+from groma.factors.contract import Example, Invariance, Measurement, Ref, Slot, register
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -123,12 +123,7 @@ class LineNormal(CameraFactor):
 
     slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("line", "line"), EXTRINSICS)
     invariance: ClassVar[Invariance] = Invariance(translation=False, scale=True)  # anchors are closest to the origin
-    measured: ClassVar[tuple[tuple[str, int], ...]] = (("normals", 3),)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        normalize_rows(self, "normals", 3)
-
+    measurements: ClassVar[tuple[Measurement, ...]] = (Measurement("normals", (3,), num_normalized=3),)
     rows: ClassVar[int] = 2
 
     def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102

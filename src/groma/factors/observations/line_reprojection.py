@@ -34,9 +34,9 @@ from groma._numba import kernel, loop
 from groma._typing import Columns, FloatArray, Inputs
 from groma.cameras.dispatch import pinhole_parameters, pinhole_parameters_jacobian
 from groma.factors._examples import indices
-from groma.factors._pixels import PixelFactor, load_row, pixel_example
+from groma.factors._pixels import INTRINSICS, PixelFactor, load_row, pixel_example
 from groma.factors._rig import EXTRINSICS, MOTION, POSE, clear_record, put_line, put_line_pose, transform_line
-from groma.factors.contract import Example, Ref, Slot, register
+from groma.factors.contract import Example, Measurement, Ref, Slot, register
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -137,14 +137,8 @@ class LineReprojection(PixelFactor):
     segments: FloatArray
 
     pinhole_only: ClassVar[bool] = True
-    slots: ClassVar[tuple[Slot, ...]] = (
-        POSE,
-        Slot("line", "line"),
-        Slot("intrinsics", "intrinsics"),
-        EXTRINSICS,
-        MOTION,
-    )
-    measured: ClassVar[tuple[tuple[str, int], ...]] = (("segments", 4),)
+    slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("line", "line"), INTRINSICS, EXTRINSICS, MOTION)
+    measurements: ClassVar[tuple[Measurement, ...]] = (Measurement("segments", (4,)),)
     rows: ClassVar[int] = 2
 
     def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102

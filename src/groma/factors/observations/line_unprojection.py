@@ -31,9 +31,9 @@ import numpy as np
 from groma._numba import loop
 from groma._typing import BoolArray, Columns, FloatArray, Inputs
 from groma.factors._examples import indices
-from groma.factors._pixels import PixelFactor, pixel_example
+from groma.factors._pixels import INTRINSICS, PixelFactor, pixel_example
 from groma.factors._rig import EXTRINSICS, MOTION, POSE, clear_record, put_line, put_line_pose, transform_line
-from groma.factors.contract import Example, Ref, Slot, register
+from groma.factors.contract import Example, Measurement, Ref, Slot, register
 from groma.factors.observations.line_bearing import bearing_sine
 
 #: Determinants of the equations for the derivative of a ray, in units of a pixel squared, below which there is none.
@@ -91,14 +91,8 @@ class LineUnprojection(PixelFactor):
     #: (N, 4) first and second end, pixels.
     segments: FloatArray
 
-    slots: ClassVar[tuple[Slot, ...]] = (
-        POSE,
-        Slot("line", "line"),
-        Slot("intrinsics", "intrinsics"),
-        EXTRINSICS,
-        MOTION,
-    )
-    measured: ClassVar[tuple[tuple[str, int], ...]] = (("segments", 4),)
+    slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("line", "line"), INTRINSICS, EXTRINSICS, MOTION)
+    measurements: ClassVar[tuple[Measurement, ...]] = (Measurement("segments", (4,)),)
     rows: ClassVar[int] = 2
 
     def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102

@@ -36,8 +36,8 @@ from groma._numba import kernel, loop
 from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices, make_example, visible_scene
 from groma.factors._record import put_block, put_residual
-from groma.factors._rig import EXTRINSICS, POSE, CameraFactor, normalize_rows
-from groma.factors.contract import Example, Ref, Slot, register
+from groma.factors._rig import EXTRINSICS, POSE, CameraFactor
+from groma.factors.contract import Example, Measurement, Ref, Slot, register
 from groma.geometry.charts.chart import perpendicular_kernel
 
 
@@ -110,18 +110,10 @@ class PlaneInCamera(CameraFactor):
 
     #: Planes in the world, any scale of (n, w).
     plane: Ref
-    #: (N, 4) measured planes (n, w), camera frame; scaled on construction: see ``num_normalized``.
+    #: (N, 4) measured planes (n, w), camera frame; scaled on construction.
     planes_in_cam: FloatArray
 
     slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("plane", "plane"), EXTRINSICS)
-    measured: ClassVar[tuple[tuple[str, int], ...]] = (("planes_in_cam", 4),)
-    #: The measurements are scaled so that this many of their numbers have norm one: 3, the normal, or all 4.
-    num_normalized: ClassVar[int]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        normalize_rows(self, "planes_in_cam", self.num_normalized)
-
     rows: ClassVar[int] = 3
 
     @classmethod
@@ -142,7 +134,7 @@ class PlaneObservation(PlaneInCamera):
     (N, 3, 3).
     """
 
-    num_normalized: ClassVar[int] = 3
+    measurements: ClassVar[tuple[Measurement, ...]] = (Measurement("planes_in_cam", (4,), num_normalized=3),)
 
     @property
     def basis(self) -> FloatArray:

@@ -38,7 +38,7 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._record import SMALL_TURN, put_block, put_residual
-from groma.factors.contract import WORLD_FIXED, Invariance, register
+from groma.factors.contract import WORLD_FIXED, Invariance, Measurement, register
 from groma.factors.observations.plane_observation import PlaneInCamera
 
 
@@ -143,7 +143,7 @@ class PlaneQuaternion(PlaneInCamera):
     Degenerate: a plane of zeros.
     """
 
-    num_normalized: ClassVar[int] = 4
+    measurements: ClassVar[tuple[Measurement, ...]] = (Measurement("planes_in_cam", (4,), num_normalized=4),)
     invariance: ClassVar[Invariance] = WORLD_FIXED  # the angle between 4-vectors depends on the world origin
 
     def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102

@@ -26,7 +26,7 @@ from groma._numba import loop
 from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices, make_example, visible_scene
 from groma.factors._rig import EXTRINSICS, POSE, CameraFactor, clear_record, put_point, put_point_pose, transform_point
-from groma.factors.contract import Example, Ref, Slot, register
+from groma.factors.contract import Example, Measurement, Ref, Slot, register
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -61,7 +61,7 @@ class PointDepth(CameraFactor):
     depths: FloatArray
 
     slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("point", "point"), EXTRINSICS)
-    measured: ClassVar[tuple[tuple[str, int], ...]] = (("depths", 0),)
+    measurements: ClassVar[tuple[Measurement, ...]] = (Measurement("depths", ()),)
     rows: ClassVar[int] = 1
 
     def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102

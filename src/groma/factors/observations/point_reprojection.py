@@ -28,9 +28,9 @@ from groma._numba import kernel, loop
 from groma._typing import Columns, FloatArray, Inputs
 from groma.cameras.dispatch import project, project_jacobian, wrap
 from groma.factors._examples import indices
-from groma.factors._pixels import PixelFactor, load_row, pixel_example, put_parameters
+from groma.factors._pixels import INTRINSICS, PixelFactor, load_row, pixel_example, put_parameters
 from groma.factors._rig import EXTRINSICS, MOTION, POSE, clear_record, put_point, put_point_pose, transform_point
-from groma.factors.contract import Example, Ref, Slot, register
+from groma.factors.contract import Example, Measurement, Ref, Slot, register
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -116,14 +116,8 @@ class PointReprojection(PixelFactor):
     #: is the habit of most bundle adjusters. Models that see behind themselves are not concerned.
     require_in_front: bool = True
 
-    slots: ClassVar[tuple[Slot, ...]] = (
-        POSE,
-        Slot("point", "point"),
-        Slot("intrinsics", "intrinsics"),
-        EXTRINSICS,
-        MOTION,
-    )
-    measured: ClassVar[tuple[tuple[str, int], ...]] = (("pixels", 2),)
+    slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("point", "point"), INTRINSICS, EXTRINSICS, MOTION)
+    measurements: ClassVar[tuple[Measurement, ...]] = (Measurement("pixels", (2,)),)
     rows: ClassVar[int] = 2
 
     def _arguments(self, inputs: tuple[Any, ...]) -> tuple[Any, ...]:

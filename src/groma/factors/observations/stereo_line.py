@@ -30,9 +30,9 @@ from groma._numba import kernel, loop
 from groma._typing import Columns, FloatArray, Inputs
 from groma.cameras.dispatch import pinhole_parameters, pinhole_parameters_jacobian
 from groma.factors._examples import indices
-from groma.factors._pixels import StereoFactor, load_row, pixel_example
+from groma.factors._pixels import INTRINSICS, StereoFactor, load_row, pixel_example
 from groma.factors._rig import EXTRINSICS, POSE, clear_record, put_line, put_line_pose, transform_line
-from groma.factors.contract import Example, Ref, Slot, register
+from groma.factors.contract import Example, Measurement, Ref, Slot, register
 from groma.factors.observations.line_reprojection import endpoint_distance, image_line_norm, put_pinhole
 
 
@@ -107,8 +107,8 @@ class StereoLine(StereoFactor):
     #: (N, 8) measured end points u1, v1, u2, v2 on the left, then on the right, in pixels.
     segments: FloatArray
 
-    slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("line", "line"), Slot("intrinsics", "intrinsics"), EXTRINSICS)
-    measured: ClassVar[tuple[tuple[str, int], ...]] = (("segments", 8),)
+    slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("line", "line"), INTRINSICS, EXTRINSICS)
+    measurements: ClassVar[tuple[Measurement, ...]] = (Measurement("segments", (8,)),)
     rows: ClassVar[int] = 4
 
     def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102

@@ -24,9 +24,9 @@ from groma._numba import kernel, loop
 from groma._typing import Columns, FloatArray, Inputs
 from groma.cameras.dispatch import pinhole_parameters, pinhole_parameters_jacobian
 from groma.factors._examples import indices
-from groma.factors._pixels import StereoFactor, load_row, pixel_example, put_parameters
+from groma.factors._pixels import INTRINSICS, StereoFactor, load_row, pixel_example, put_parameters
 from groma.factors._rig import EXTRINSICS, POSE, clear_record, put_point, put_point_pose, transform_point
-from groma.factors.contract import Example, Ref, Slot, register
+from groma.factors.contract import Example, Measurement, Ref, Slot, register
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -105,8 +105,8 @@ class StereoPoint(StereoFactor):
     #: (N, 3) measured u left, v, u right in pixels; the disparity is u left - u right.
     pixels: FloatArray
 
-    slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("point", "point"), Slot("intrinsics", "intrinsics"), EXTRINSICS)
-    measured: ClassVar[tuple[tuple[str, int], ...]] = (("pixels", 3),)
+    slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("point", "point"), INTRINSICS, EXTRINSICS)
+    measurements: ClassVar[tuple[Measurement, ...]] = (Measurement("pixels", (3,)),)
     rows: ClassVar[int] = 3
 
     def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102

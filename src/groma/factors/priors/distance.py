@@ -39,8 +39,7 @@ from groma._numba import loop
 from groma._typing import BoolArray, Columns, FloatArray, Inputs
 from groma.errors import ShapeError
 from groma.factors._examples import make_example, random_poses
-from groma.factors._record import set_rows
-from groma.factors.contract import Example, Factor, Ref, Slot, register
+from groma.factors.contract import Example, Factor, Measurement, Ref, Slot, register
 from groma.factors.priors._places import KINDS, place_on, put_place
 
 
@@ -167,12 +166,15 @@ class Distance(Factor):
         for side in ("first", "second")
         for name, kind in zip(("camera", "point", "line", "plane"), KINDS, strict=True)
     )
+    measurements: ClassVar[tuple[Measurement, ...]] = (
+        Measurement("distances", ()),
+        Measurement("first_arm", (3,)),
+        Measurement("second_arm", (3,)),
+    )
     rows: ClassVar[int] = 1
 
     def __post_init__(self) -> None:
-        set_rows(self, "distances")
-        set_rows(self, "first_arm", 3)
-        set_rows(self, "second_arm", 3)
+        super().__post_init__()
         shortest = np.zeros(len(self), bool) if self.is_shortest is None else np.asarray(self.is_shortest, bool)
         if shortest.shape != (len(self),) or (shortest.any() and (self.first_line is None or self.second_line is None)):
             raise ShapeError(f"Distance.is_shortest must be ({len(self)},) flags of two lines; got {shortest.shape}.")

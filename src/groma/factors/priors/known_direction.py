@@ -26,9 +26,8 @@ import numpy as np
 from groma._numba import loop
 from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices, make_example, random_poses
-from groma.factors._record import set_rows
-from groma.factors._rig import EXTRINSICS, POSE, CameraFactor, normalize_rows
-from groma.factors.contract import Example, Factor, Invariance, Ref, Slot, register
+from groma.factors._rig import EXTRINSICS, POSE, CameraFactor
+from groma.factors.contract import Example, Factor, Invariance, Measurement, Ref, Slot, register
 from groma.geometry.manifold import FACTOR_COLUMNS
 
 #: Of factors that compare directions with those of the world.
@@ -120,14 +119,12 @@ class CameraDirection(CameraFactor):
     in_camera: FloatArray
 
     slots: ClassVar[tuple[Slot, ...]] = (POSE, EXTRINSICS)
-    measured: ClassVar[tuple[tuple[str, int], ...]] = (("in_world", 3), ("in_camera", 3))
+    measurements: ClassVar[tuple[Measurement, ...]] = (
+        Measurement("in_world", (3,), num_normalized=3),
+        Measurement("in_camera", (3,), num_normalized=3),
+    )
     invariance: ClassVar[Invariance] = _TURNED
     rows: ClassVar[int] = 2
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        normalize_rows(self, "in_world", 3)
-        normalize_rows(self, "in_camera", 3)
 
     @cached_property
     def _bases(self) -> FloatArray:
@@ -163,9 +160,7 @@ class KnownDirection(Factor):
     invariance: ClassVar[Invariance] = _TURNED
     rows: ClassVar[int] = 2
 
-    def __post_init__(self) -> None:
-        set_rows(self, "known", 3)
-        normalize_rows(self, "known", 3)
+    measurements: ClassVar[tuple[Measurement, ...]] = (Measurement("known", (3,), num_normalized=3),)
 
     @cached_property
     def _bases(self) -> FloatArray:

@@ -17,9 +17,7 @@ import numpy as np
 from groma._numba import loop
 from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices, make_example, random_poses
-from groma.factors._record import set_rows
-from groma.factors._rig import normalize_rows
-from groma.factors.contract import WORLD_FIXED, Example, Factor, Invariance, Ref, Slot, register
+from groma.factors.contract import WORLD_FIXED, Example, Factor, Invariance, Measurement, Ref, Slot, register
 from groma.factors.priors._places import KINDS, place_on, put_place
 
 
@@ -65,10 +63,10 @@ class OnKnownPlane(Factor):
     rows: ClassVar[int] = 1
     invariance: ClassVar[Invariance] = WORLD_FIXED
 
-    def __post_init__(self) -> None:
-        set_rows(self, "known", 4)
-        set_rows(self, "arm", 3)
-        normalize_rows(self, "known", 3)
+    measurements: ClassVar[tuple[Measurement, ...]] = (
+        Measurement("known", (4,), num_normalized=3),
+        Measurement("arm", (3,)),
+    )
 
     def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:  # noqa: D102
         return (np.ascontiguousarray(ambients[0]),)

@@ -24,8 +24,8 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import make_example, random_poses
-from groma.factors._record import poses_from_states, put_residual, set_rows
-from groma.factors.contract import Example, Factor, Ref, Slot, register
+from groma.factors._record import poses_from_states, put_residual
+from groma.factors.contract import Example, Factor, Measurement, Ref, Slot, register
 from groma.factors.priors.pose_prior import compose_with_inverse, inverse_left_jacobian, pose_log
 
 
@@ -100,9 +100,7 @@ class PoseBetween(Factor):
 
     slots: ClassVar[tuple[Slot, ...]] = (Slot("first", "pose"), Slot("second", "pose"))
 
-    def __post_init__(self) -> None:
-        set_rows(self, "first_from_second", 7)
-
+    measurements: ClassVar[tuple[Measurement, ...]] = (Measurement("first_from_second", (7,)),)
     rows: ClassVar[int] = 6
 
     def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:  # noqa: D102

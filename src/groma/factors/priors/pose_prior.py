@@ -30,8 +30,8 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices, make_example, random_poses
-from groma.factors._record import SMALL_TURN, poses_from_states, put_block, put_residual, set_rows
-from groma.factors.contract import WORLD_FIXED, Example, Factor, Invariance, Ref, Slot, register
+from groma.factors._record import SMALL_TURN, poses_from_states, put_block, put_residual
+from groma.factors.contract import WORLD_FIXED, Example, Factor, Invariance, Measurement, Ref, Slot, register
 from groma.geometry.quaternion import log_kernel
 from groma.geometry.so3 import left_jacobian_inverse_kernel
 
@@ -170,9 +170,7 @@ class PosePrior(Factor):
     slots: ClassVar[tuple[Slot, ...]] = (Slot("pose", "pose"),)
     invariance: ClassVar[Invariance] = WORLD_FIXED
 
-    def __post_init__(self) -> None:
-        set_rows(self, "cam_from_world", 7)
-
+    measurements: ClassVar[tuple[Measurement, ...]] = (Measurement("cam_from_world", (7,)),)
     rows: ClassVar[int] = 6
 
     def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:  # noqa: D102

@@ -19,7 +19,7 @@ from groma._numba import loop
 from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices, make_example
 from groma.factors._rig import EXTRINSICS, POSE, CameraFactor
-from groma.factors.contract import WORLD_FIXED, Example, Invariance, Ref, Slot, register
+from groma.factors.contract import WORLD_FIXED, Example, Invariance, Measurement, Ref, Slot, register
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -47,7 +47,7 @@ class PositionPrior(CameraFactor):
     cam_center_in_world: FloatArray
 
     slots: ClassVar[tuple[Slot, ...]] = (POSE, EXTRINSICS)
-    measured: ClassVar[tuple[tuple[str, int], ...]] = (("cam_center_in_world", 3),)
+    measurements: ClassVar[tuple[Measurement, ...]] = (Measurement("cam_center_in_world", (3,)),)
     invariance: ClassVar[Invariance] = WORLD_FIXED
     rows: ClassVar[int] = 3
 

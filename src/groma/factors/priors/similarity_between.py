@@ -38,8 +38,8 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import make_example, random_poses
-from groma.factors._record import put_residual, set_rows
-from groma.factors.contract import ANY_SIMILARITY, Example, Factor, Invariance, Ref, Slot, register
+from groma.factors._record import put_residual
+from groma.factors.contract import ANY_SIMILARITY, Example, Factor, Invariance, Measurement, Ref, Slot, register
 from groma.geometry import sim3
 from groma.geometry.quaternion import log_kernel, multiply_kernel, to_matrix_kernel
 from groma.geometry.so3 import left_jacobian_inverse_kernel
@@ -150,8 +150,7 @@ class SimilarityBetween(Factor):
     rows: ClassVar[int] = 7
     invariance: ClassVar[Invariance | None] = ANY_SIMILARITY
 
-    def __post_init__(self) -> None:
-        set_rows(self, "first_from_second", 8)
+    measurements: ClassVar[tuple[Measurement, ...]] = (Measurement("first_from_second", (8,)),)
 
     def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:  # noqa: D102
         return *ambients, sim3.inverse(self.first_from_second)

@@ -46,7 +46,7 @@ from groma._numba import kernel, loop
 from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices, make_example, random_poses
 from groma.factors._record import put_block, put_residual, set_rows
-from groma.factors.contract import WORLD_FIXED, Example, Factor, Invariance, Ref, Slot, register
+from groma.factors.contract import WORLD_FIXED, Example, Factor, Invariance, Measurement, Ref, Slot, register
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -207,6 +207,7 @@ class LineOnPlane(_LineAndPlane):
     anchor: FloatArray | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.anchor is not None:
             set_rows(self, "anchor", 3)
 
@@ -235,8 +236,7 @@ class SegmentOnPlane(_LineAndPlane):
 
     slots: ClassVar[tuple[Slot, ...]] = (*_LineAndPlane.slots, Slot("frame", "pose", optional=True))
 
-    def __post_init__(self) -> None:
-        set_rows(self, "ends", 2, 3)
+    measurements: ClassVar[tuple[Measurement, ...]] = (Measurement("ends", (2, 3)),)
 
     def linearize(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
         if self.frame is None:

@@ -19,9 +19,9 @@ import numpy as np
 
 from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices
-from groma.factors._pixels import PixelFactor, pixel_example
+from groma.factors._pixels import INTRINSICS, PixelFactor, pixel_example
 from groma.factors._rig import EXTRINSICS, POSE
-from groma.factors.contract import Example, Ref, Slot, register
+from groma.factors.contract import Example, Measurement, Ref, Slot, register
 from groma.factors.observations.line_reprojection import linearize_pixels
 
 
@@ -40,8 +40,8 @@ class LineToPixel(PixelFactor):
     pixels: FloatArray
 
     pinhole_only: ClassVar[bool] = True
-    slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("line", "line"), Slot("intrinsics", "intrinsics"), EXTRINSICS)
-    measured: ClassVar[tuple[tuple[str, int], ...]] = (("pixels", 2),)
+    slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("line", "line"), INTRINSICS, EXTRINSICS)
+    measurements: ClassVar[tuple[Measurement, ...]] = (Measurement("pixels", (2,)),)
     rows: ClassVar[int] = 1
 
     def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102

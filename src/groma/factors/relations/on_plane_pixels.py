@@ -40,10 +40,9 @@ from groma._numba import kernel, loop
 from groma._typing import Columns, FloatArray, Inputs
 from groma.cameras.dispatch import project_jacobian, wrap
 from groma.factors._examples import indices
-from groma.factors._pixels import PixelFactor, load_row, pixel_example
-from groma.factors._record import set_rows
+from groma.factors._pixels import INTRINSICS, PixelFactor, load_row, pixel_example
 from groma.factors._rig import EXTRINSICS, POSE, clear_block, clear_record
-from groma.factors.contract import WORLD_FIXED, Example, Invariance, Ref, Slot, register
+from groma.factors.contract import WORLD_FIXED, Example, Invariance, Measurement, Ref, Slot, register
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -242,10 +241,7 @@ class PointOnPlanePixels(_OnPlanePixels):
     #: Points in the world.
     point: Ref
 
-    slots: ClassVar[tuple[Slot, ...]] = (
-        POSE, Slot("point", "point"), Slot("plane", "plane"), Slot("intrinsics", "intrinsics"), EXTRINSICS,
-    )  # fmt: skip
-
+    slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("point", "point"), Slot("plane", "plane"), INTRINSICS, EXTRINSICS)
     rows: ClassVar[int] = 2
 
     def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102
@@ -276,15 +272,10 @@ class SegmentOnPlanePixels(_OnPlanePixels):
     #: (N, 2, 3) world points near the two ends of each segment.
     ends: FloatArray
 
-    slots: ClassVar[tuple[Slot, ...]] = (
-        POSE, Slot("line", "line"), Slot("plane", "plane"), Slot("intrinsics", "intrinsics"), EXTRINSICS,
-    )  # fmt: skip
+    slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("line", "line"), Slot("plane", "plane"), INTRINSICS, EXTRINSICS)
     invariance: ClassVar[Invariance] = WORLD_FIXED  # ends are world points
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        set_rows(self, "ends", 2, 3)
-
+    measurements: ClassVar[tuple[Measurement, ...]] = (Measurement("ends", (2, 3)),)
     rows: ClassVar[int] = 4
 
     def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102

@@ -28,17 +28,9 @@ from groma._numba import loop
 from groma._typing import Columns, FloatArray, Inputs
 from groma.cameras.dispatch import project_jacobian
 from groma.factors._examples import indices
-from groma.factors._pixels import PixelFactor, load_row, pixel_example
-from groma.factors._rig import (
-    EXTRINSICS,
-    POSE,
-    clear_record,
-    normalize_rows,
-    put_point,
-    put_point_pose,
-    transform_point,
-)
-from groma.factors.contract import Example, Ref, Slot, register
+from groma.factors._pixels import INTRINSICS, PixelFactor, load_row, pixel_example
+from groma.factors._rig import EXTRINSICS, POSE, clear_record, put_point, put_point_pose, transform_point
+from groma.factors.contract import Example, Measurement, Ref, Slot, register
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -88,13 +80,8 @@ class PointToImageLine(PixelFactor):
     #: (N, 3) measured image lines a, b, c with a u + b v + c = 0 in pixels, any scale.
     image_lines: FloatArray
 
-    slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("point", "point"), Slot("intrinsics", "intrinsics"), EXTRINSICS)
-    measured: ClassVar[tuple[tuple[str, int], ...]] = (("image_lines", 3),)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        normalize_rows(self, "image_lines", 2)
-
+    slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("point", "point"), INTRINSICS, EXTRINSICS)
+    measurements: ClassVar[tuple[Measurement, ...]] = (Measurement("image_lines", (3,), num_normalized=2),)
     rows: ClassVar[int] = 1
 
     def evaluate(self, inputs: Inputs, begin: int, end: int, columns: Columns, record: FloatArray) -> int:  # noqa: D102

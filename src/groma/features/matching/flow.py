@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from groma._rows import numbered
 from groma._trees import kd_tree
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
@@ -125,8 +126,7 @@ def _pair(image_1: npt.NDArray[np.generic], image_2: npt.NDArray[np.generic]) ->
 def _along(segments: Segments, step: float) -> tuple[FloatArray, IntArray]:
     """Points along all segments (S, 2), at most `step` apart, and the segment each belongs to."""
     count = np.maximum(np.ceil(segments.length / step), 2).astype(np.int64)
-    owner = np.repeat(np.arange(len(segments)), count)
-    place = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
+    owner, place = numbered(count)
     t = ((place + 0.5) / count[owner])[:, None]
     ends = segments.ends[owner]
     return (1.0 - t) * ends[:, :2] + t * ends[:, 2:], owner

@@ -109,6 +109,7 @@ def inverse_polynomial(
     found = np.linalg.lstsq(np.hstack([powers, -powers / stretch[:, None]]), 1.0 / stretch - 1.0, rcond=1e-13)[0]
     ratio = (1.0 + powers @ found[:3]) / (1.0 + powers @ found[3:])
     slip = focal * float((np.sqrt(ray) * np.abs(ratio - 1.0 / stretch)).max())
+    # derived from the derivative of coefficient * r^3
     if not (1.0 + 3.0 * coefficient * squared > 0.0).all() or not slip <= SLIP_PX:
         raise FileFormatError(
             f"a lens with the distortion {coefficient:g} folds the image within the {reach:.2g} focal lengths that are "

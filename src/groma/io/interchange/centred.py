@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from groma._rows import numbered
 from groma._typing import FloatArray, IntArray
 from groma.errors import FileFormatError
 from groma.io.interchange.calibration import Calibration, camera_table
@@ -54,15 +55,12 @@ def point_rows(numbers: FloatArray, count: int, path: Path) -> PointRows:
         at += 7 + 4 * int(views)
         starts[row + 1] = at
     head = starts[:-1, None] + np.arange(6)
-    num_views = (np.diff(starts) - 7) // 4
-    first = np.repeat(starts[:-1] + 7, num_views)
-    within = np.arange(len(first)) - np.repeat(np.cumsum(num_views) - num_views, num_views)
-    views = numbers[(first + 4 * within)[:, None] + np.arange(4)]
+    point_idx, within = numbered((np.diff(starts) - 7) // 4)
+    views = numbers[(starts[point_idx] + 7 + 4 * within)[:, None] + np.arange(4)]
     if (views[:, 0] != np.floor(views[:, 0])).any() or (np.abs(views[:, 0]) > 2**31).any():
         raise FileFormatError(f"{path}: a view names an image by a number that is not whole. Correct the file.")
     points = numbers[head].reshape(-1, 6)
-    image_idx, point_idx = views[:, 0].astype(np.int64), np.repeat(np.arange(count), num_views)
-    return PointRows(points[:, :3], points[:, 3:], point_idx, image_idx, views[:, 2:], at)
+    return PointRows(points[:, :3], points[:, 3:], point_idx, views[:, 0].astype(np.int64), views[:, 2:], at)
 
 
 def centred_scene(

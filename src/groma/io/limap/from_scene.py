@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from groma._rows import numbered
 from groma._typing import FloatArray, IntArray
 from groma.errors import FileFormatError, InputError
 from groma.io._numbering import numbered_keypoints
@@ -238,9 +239,8 @@ class _Inverse:
 
     def rows(self, landmarks: IntArray) -> IntArray:
         """Return the rows of several landmarks, one landmark after the other."""
-        count = self.count[landmarks]
-        inside = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-        return self.order[np.repeat(self.start[landmarks], count) + inside]
+        owner, inside = numbered(self.count[landmarks])
+        return self.order[self.start[landmarks][owner] + inside]
 
 
 # Identifiers

@@ -87,27 +87,14 @@ def _is_video(place: Path) -> bool:
 
 
 for _layout in (
-    SequenceLayout("video", "", _here(_is_video), lambda path, w: open_video(path, w.calibration, w.selection)),
-    SequenceLayout(
-        "tum_rgbd", "rgb.txt or associations.txt (TUM)", _here(is_tum_rgbd),
-        lambda path, w: open_tum_rgbd(path, w.calibration, w.depth_scale, w.selection),
-    ),
-    SequenceLayout(
-        "euroc", "mav0/cam0 (EuRoC)", euroc_root, lambda path, w: open_euroc(path, w.calibration, w.selection)
-    ),
-    SequenceLayout(
-        "kitti", "image_0 (KITTI)", _here(is_kitti), lambda path, w: open_kitti(path, w.calibration, w.selection)
-    ),
-    SequenceLayout(
-        "seven_scenes", "frame-000000.color.png (7-Scenes)", seven_scenes_root,
-        lambda path, w: open_seven_scenes(path, w.calibration, w.depth_scale, w.selection),
-    ),
-    SequenceLayout(
-        "two_folders", "rgb or color with depth", _here(is_two_folders),
-        lambda path, w: open_two_folders(path, w.calibration, w.depth_scale, w.selection),
-    ),
-    SequenceLayout("images", "", _here(image_files), lambda path, w: open_images(path, w.calibration, w.selection)),
-):  # fmt: skip
+    SequenceLayout("video", "", _here(_is_video), open_video),
+    SequenceLayout("tum_rgbd", "rgb.txt or associations.txt (TUM)", _here(is_tum_rgbd), open_tum_rgbd),
+    SequenceLayout("euroc", "mav0/cam0 (EuRoC)", euroc_root, open_euroc),
+    SequenceLayout("kitti", "image_0 (KITTI)", _here(is_kitti), open_kitti),
+    SequenceLayout("seven_scenes", "frame-000000.color.png (7-Scenes)", seven_scenes_root, open_seven_scenes),
+    SequenceLayout("two_folders", "rgb or color with depth", _here(is_two_folders), open_two_folders),
+    SequenceLayout("images", "", _here(image_files), open_images),
+):
     register_layout(_layout)
 
 __all__ = [

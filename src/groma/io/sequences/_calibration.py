@@ -101,8 +101,9 @@ def _pixels_of(
     if camera_from_target is not None:
         rays = rays @ camera_from_target.T
     pixels = cameras.model(calibration.model).project(calibration.params, rays)
+    # derived from the range of 16 bits that OpenCV keeps places in; far outside there is no pixel
     pixels[(rays[:, 2] <= 0) | ~np.isfinite(pixels).all(1)] = -100.0
-    # OpenCV counts from the centre of the first pixel.
+    # OpenCV counts from the centre of the first pixel; derived from the same range.
     return np.clip(pixels - 0.5, -100.0, 16000.0).reshape(len(rows), width, 2).astype(np.float32)
 
 

@@ -23,8 +23,9 @@ from groma.errors import FileFormatError, InputError
 from groma.geometry import se3
 from groma.io.reading import reading
 from groma.io.sequences._calibration import Calibration, from_opencv, rectification
-from groma.io.sequences._reader import Entry, FileSequence, Preparation, Selection, file_size, simple_sequence
+from groma.io.sequences._reader import Entry, FileSequence, Preparation, file_size, simple_sequence
 from groma.io.sequences.frame import SequenceCamera
+from groma.io.sequences.layouts import Wishes
 from groma.io.sequences.tum_rgbd import pair_by_time
 from groma.io.trajectories import Trajectory, read_trajectory
 
@@ -50,9 +51,9 @@ class _Sensor:
     images: list[tuple[float, Path]]
 
 
-def open_euroc(root: Path, calibration: Calibration | None, selection: Selection) -> FileSequence:
+def open_euroc(root: Path, wishes: Wishes) -> FileSequence:
     """Open the folder that holds ``cam0``; see :func:`groma.io.sequences.open_sequence`."""
-    warnings: list[str] = []
+    calibration, selection, warnings = wishes.calibration, wishes.selection, []
     has_right = (root / "cam1" / "data").is_dir() and selection.kind != "mono"
     kind = selection.kind_of("stereo" if has_right else "mono")
     left = _sensor(root / "cam0", calibration)

@@ -25,6 +25,7 @@ from groma.io.reading import reading
 from groma.io.sequences._calibration import Calibration, find_calibration, rectification
 from groma.io.sequences._reader import Entry, FileSequence, Selection, read_ahead, simple_sequence
 from groma.io.sequences.frame import Frame, Kind, SequenceCamera
+from groma.io.sequences.layouts import Wishes
 from groma.io.trajectories import Trajectory, read_trajectory
 
 #: Default frame rate, 1/s (convention: usual for video).
@@ -47,25 +48,25 @@ def image_files(folder: Path) -> list[Path]:
     return []
 
 
-def open_images(folder: Path, calibration: Calibration | None, selection: Selection) -> FileSequence:
+def open_images(folder: Path, wishes: Wishes) -> FileSequence:
     """Open a folder of images; see :func:`groma.io.sequences.open_sequence`."""
     warnings: list[str] = []
-    kind = selection.kind_of("mono")
+    kind = wishes.selection.kind_of("mono")
     images = image_files(folder)
-    calibration = calibration or find_calibration(folder) or find_calibration(images[0].parent)
+    calibration = wishes.calibration or find_calibration(folder) or find_calibration(images[0].parent)
     if calibration is None:
         raise InputError(NO_CAMERA.format(path=folder))
     entries = [Entry(time, path) for time, path in zip(times_of(folder, images), images, strict=True)]
-    return simple_sequence(kind, selection.of(entries, warnings), calibration, reference_of(folder), warnings)
+    return simple_sequence(kind, wishes.selection.of(entries, warnings), calibration, reference_of(folder), warnings)
 
 
-def open_video(path: Path, calibration: Calibration | None, selection: Selection) -> VideoSequence:
+def open_video(path: Path, wishes: Wishes) -> VideoSequence:
     """Open a video file; see :func:`groma.io.sequences.open_sequence`."""
-    selection.kind_of("mono")
-    calibration = calibration or find_calibration(path.parent)
+    wishes.selection.kind_of("mono")
+    calibration = wishes.calibration or find_calibration(path.parent)
     if calibration is None:
         raise InputError(NO_CAMERA.format(path=path))
-    return VideoSequence(path, calibration, selection)
+    return VideoSequence(path, calibration, wishes.selection)
 
 
 class VideoSequence:

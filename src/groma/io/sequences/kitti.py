@@ -16,8 +16,9 @@ from groma._typing import FloatArray
 from groma.bounded.text import finite, read_lines, read_words
 from groma.errors import FileFormatError
 from groma.io.reading import reading
-from groma.io.sequences._calibration import Calibration, from_opencv
-from groma.io.sequences._reader import Entry, FileSequence, Selection, simple_sequence
+from groma.io.sequences._calibration import from_opencv
+from groma.io.sequences._reader import Entry, FileSequence, simple_sequence
+from groma.io.sequences.layouts import Wishes
 from groma.io.trajectories import Trajectory, read_trajectory
 
 #: Frames a second where there is no ``times.txt`` (convention: as in the benchmark).
@@ -29,8 +30,9 @@ def is_kitti(folder: Path) -> bool:
     return any((folder / name).is_dir() for name in ("image_0", "image_2"))
 
 
-def open_kitti(folder: Path, calibration: Calibration | None, selection: Selection) -> FileSequence:
+def open_kitti(folder: Path, wishes: Wishes) -> FileSequence:
     """Open a folder; see :func:`groma.io.sequences.open_sequence`."""
+    calibration = wishes.calibration
     left, right = ("image_0", "image_1") if (folder / "image_0").is_dir() else ("image_2", "image_3")
     has_right = (folder / right).is_dir()
     matrices = _matrices(folder / "calib.txt") if (folder / "calib.txt").is_file() else {}
@@ -44,7 +46,7 @@ def open_kitti(folder: Path, calibration: Calibration | None, selection: Selecti
     if has_right and not (baseline is not None and baseline > 0):
         warnings.append(f"calib.txt says no baseline from {left} to {right}; only {left} is used.")
         has_right = False
-    kind = selection.kind_of("stereo" if has_right else "mono")
+    kind = wishes.selection.kind_of("stereo" if has_right else "mono")
     if calibration is None:
         assert projection is not None
         calibration = from_opencv(projection[[0, 1, 0, 1], [0, 1, 2, 2]])
@@ -60,7 +62,9 @@ def open_kitti(folder: Path, calibration: Calibration | None, selection: Selecti
         for number, path in zip(numbers, images, strict=True)
     ]
     reference = _reference(folder, times, count if times is None else len(times), warnings)
-    return simple_sequence(kind, selection.of(entries, warnings), calibration, reference, warnings, baseline=baseline)
+    return simple_sequence(
+        kind, wishes.selection.of(entries, warnings), calibration, reference, warnings, baseline=baseline
+    )
 
 
 def _matrices(path: Path) -> dict[str, FloatArray]:

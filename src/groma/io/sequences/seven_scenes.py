@@ -21,8 +21,9 @@ from groma.bounded.text import read_words
 from groma.errors import FileFormatError
 from groma.geometry import se3, so3
 from groma.io.reading import reading
-from groma.io.sequences._calibration import Calibration, from_opencv, read_calibration
-from groma.io.sequences._reader import Entry, FileSequence, Preparation, Selection, simple_sequence
+from groma.io.sequences._calibration import from_opencv, read_calibration
+from groma.io.sequences._reader import Entry, FileSequence, Preparation, simple_sequence
+from groma.io.sequences.layouts import Wishes
 from groma.io.trajectories import Trajectory
 
 #: Frames a second (convention: of the camera; the format says none).
@@ -74,9 +75,7 @@ def seven_scenes_root(folder: Path) -> Path | None:
     return None
 
 
-def open_seven_scenes(
-    root: Path, calibration: Calibration | None, depth_scale: float | None, selection: Selection
-) -> FileSequence:
+def open_seven_scenes(root: Path, wishes: Wishes) -> FileSequence:
     """Open the folder that holds the frames; ``calibration`` is that of the colour camera.
 
     See :func:`groma.io.sequences.open_sequence`.
@@ -84,9 +83,9 @@ def open_seven_scenes(
     warnings: list[str] = []
     colors = sorted(root.glob("*.color.*"), key=_number)
     depths = {_number(path): path for path in root.glob("*.depth.*")}
-    kind = selection.kind_of("rgbd" if depths else "mono")
+    kind = wishes.selection.kind_of("rgbd" if depths else "mono")
     entries = [Entry(_number(path) / RATE, path, depths.get(_number(path))) for path in colors]
-    calibration = calibration or from_opencv(COLOR_CAMERA)
+    calibration = wishes.calibration or from_opencv(COLOR_CAMERA)
     given = next((path for path in (root.parent, root) if (path / "camera-intrinsics.txt").is_file()), None)
     depth_camera = from_opencv(DEPTH_CAMERA) if given is None else read_calibration(given / "camera-intrinsics.txt")
     source, target = depth_camera.pinhole(), calibration.pinhole()
@@ -97,9 +96,11 @@ def open_seven_scenes(
         register_depth(depth, source, target, transform, registered)
         return registered
 
-    preparation = Preparation(depth_scale=depth_scale or DEPTH_SCALE, register=register if kind == "rgbd" else None)
+    preparation = Preparation(
+        depth_scale=wishes.depth_scale or DEPTH_SCALE, register=register if kind == "rgbd" else None
+    )
     return simple_sequence(
-        kind, selection.of(entries, warnings), calibration, _reference(root, colors), warnings, preparation
+        kind, wishes.selection.of(entries, warnings), calibration, _reference(root, colors), warnings, preparation
     )
 
 

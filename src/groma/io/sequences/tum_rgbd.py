@@ -19,7 +19,8 @@ from groma.bounded.text import finite, read_words
 from groma.errors import FileFormatError, InputError
 from groma.io.reading import reading
 from groma.io.sequences._calibration import Calibration, find_calibration, from_opencv
-from groma.io.sequences._reader import Entry, FileSequence, Preparation, Selection, simple_sequence
+from groma.io.sequences._reader import Entry, FileSequence, Preparation, simple_sequence
+from groma.io.sequences.layouts import Wishes
 from groma.io.trajectories import read_trajectory
 
 #: Calibrations of the three colour cameras of the benchmark: fx, fy, cx, cy, k1, k2, p1, p2, k3.
@@ -39,17 +40,15 @@ def is_tum_rgbd(folder: Path) -> bool:
     return (folder / "rgb.txt").is_file() or (folder / "associations.txt").is_file()
 
 
-def open_tum_rgbd(
-    folder: Path, calibration: Calibration | None, depth_scale: float | None, selection: Selection
-) -> FileSequence:
+def open_tum_rgbd(folder: Path, wishes: Wishes) -> FileSequence:
     """Open a folder; see :func:`groma.io.sequences.open_sequence`."""
-    calibration = calibration or find_calibration(folder) or _freiburg(folder)
+    calibration = wishes.calibration or find_calibration(folder) or _freiburg(folder)
     warnings: list[str] = []
-    kind = selection.kind_of("rgbd" if _has_depth(folder) else "mono")
-    entries = selection.of(_entries(folder), warnings)
+    kind = wishes.selection.kind_of("rgbd" if _has_depth(folder) else "mono")
+    entries = wishes.selection.of(_entries(folder), warnings)
     truth = folder / "groundtruth.txt"
     reference = read_trajectory(truth, "tum") if truth.is_file() else None
-    preparation = Preparation(depth_scale=depth_scale or DEPTH_SCALE)
+    preparation = Preparation(depth_scale=wishes.depth_scale or DEPTH_SCALE)
     return simple_sequence(kind, entries, calibration, reference, warnings, preparation)
 
 

@@ -19,9 +19,10 @@ from groma.bounded.images import decoded
 from groma.bounded.names import IMAGES
 from groma.errors import FileFormatError, InputError
 from groma.io.sequences import tum_rgbd
-from groma.io.sequences._calibration import Calibration, find_calibration
-from groma.io.sequences._reader import Entry, FileSequence, Preparation, Selection, simple_sequence
+from groma.io.sequences._calibration import find_calibration
+from groma.io.sequences._reader import Entry, FileSequence, Preparation, simple_sequence
 from groma.io.sequences.images import NO_CAMERA, reference_of, times_of
+from groma.io.sequences.layouts import Wishes
 
 #: Folders of colour, those that others are named after first (belongs to the format).
 COLOR = ("rgb", "color", "image", "images")
@@ -36,22 +37,21 @@ def is_two_folders(folder: Path) -> bool:
     return bool(_images(folder / DEPTH)) and any(_images(folder / name) for name in COLOR)
 
 
-def open_two_folders(
-    folder: Path, calibration: Calibration | None, depth_scale: float | None, selection: Selection
-) -> FileSequence:
+def open_two_folders(folder: Path, wishes: Wishes) -> FileSequence:
     """Open a folder; see :func:`groma.io.sequences.open_sequence`."""
     colors = next(found for name in COLOR if (found := _images(folder / name)))
     depths = _images(folder / DEPTH)
-    calibration = calibration or find_calibration(folder) or find_calibration(colors[0].parent)
+    calibration = wishes.calibration or find_calibration(folder) or find_calibration(colors[0].parent)
     if calibration is None:
         raise InputError(NO_CAMERA.format(path=folder))
     warnings: list[str] = []
-    kind = selection.kind_of("rgbd")
+    kind = wishes.selection.kind_of("rgbd")
     pairs = _pairs(colors, depths)
     entries = [
         Entry(time, path, depths[pairs[row]] if row in pairs else None)
         for row, (time, path) in enumerate(zip(times_of(folder, colors), colors, strict=True))
     ]
+    depth_scale = wishes.depth_scale
     if depth_scale is None:
         depth_scale = _scale(depths)
         if kind == "rgbd" and depth_scale != 1.0:
@@ -61,7 +61,7 @@ def open_two_folders(
             )
     preparation = Preparation(depth_scale=depth_scale)
     return simple_sequence(
-        kind, selection.of(entries, warnings), calibration, reference_of(folder), warnings, preparation
+        kind, wishes.selection.of(entries, warnings), calibration, reference_of(folder), warnings, preparation
     )
 
 

@@ -239,7 +239,7 @@ def geocentric(coordinates: FloatArray) -> FloatArray:
 
 def _utm_of(groups: Sequence[Places]) -> str:
     longitude, latitude = np.nanmedian(np.concatenate([group.coordinates for group in groups]), axis=0)[:2]
-    return _utm(min(int((longitude + 180.0) // 6.0) + 1, 60), latitude < 0.0)
+    return _utm(min(int((longitude + 180.0) // 6.0) + 1, 60), latitude < 0.0)  # convention: zones of six degrees
 
 
 def _projected(group: Places, target: str) -> FloatArray:

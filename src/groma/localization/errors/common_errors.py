@@ -168,7 +168,7 @@ def common_errors(
     """
     frames, count = scene.num_frames, max(len(row) for row in _params(scene)) if estimated[1] else 0
     beyond = np.zeros((frames, 6, 6))
-    if 6 * frames + count * len(scene.cameras) > gates.unknowns:
+    if 6 * frames + count * len(scene.cameras) > gates.unknowns:  # derived from the six numbers of a pose
         return None, beyond
     bare = scene.keep(planes=[], directions=[])
     seen, lines = bare.point_observations, bare.line_observations

@@ -124,7 +124,7 @@ def evidence_of(refined: Refined, matches: Matches, places: int = 1) -> Evidence
     line_agree, line_chance = _joined(line, refined.line_inliers, by_chance)
     agree, chance = np.concatenate([agree, line_agree]), np.concatenate([chance, line_chance])
     n, k = len(agree), int(agree.sum())
-    if k <= 3:
+    if k <= 3:  # derived from three matches that fix a pose
         return Evidence(k, n, math.inf)
     mean = _mean_logarithm(chance, len(chance) - len(line_chance))[agree]
     spent = np.sort(mean)[:3]  # those that say most were used up

@@ -171,7 +171,7 @@ def _spread(scene: Scene, noise: LineNoise) -> FloatArray:
     ]
     number = np.maximum(np.bincount(seen.line_idx, minlength=scene.num_lines), 1)
     xx, xy, yy = (moment / number for moment in moments)
-    smaller = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
+    smaller = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)  # derived from the roots of a quadratic
     return np.sqrt(np.maximum(smaller, _MIN_SPREAD**2))
 
 

@@ -116,4 +116,5 @@ def _lines(number: int) -> str:
 
 
 def _percent(part: int, total: int) -> str:
+    # derived from rounding to whole percents
     return f"{100.0 * part / total:.0f} %" if 200 * part >= total else "under 1 %"

@@ -63,6 +63,7 @@ def noise_of_given(squared: FloatArray, redundancy: FloatArray) -> GivenNoise:
     half, k, variance = (count + 2) // 2, count, 0.0
     for k in range(half, count + 1):
         variance = total[k - 1] / freedom[k - 1] / _truncated(k / count)
+        # derived from three coordinates
         if k == count or ratio[k] > 3.0 * variance * f.isf(NORMAL.false_alarm / count, 3, 3 * k):
             break
     if k < count:

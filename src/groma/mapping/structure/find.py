@@ -166,7 +166,7 @@ def detect_structure(
     planes, new = _only(planes, kept)
     found |= {"point_on_plane": point_on_plane.renumbered(new), "line_on_plane": line_on_plane.renumbered(new)}
     found["line_along_direction"] = along
-    found["point_on_line"] = on_line if options.points_on_lines else Pairs.none()
+    found["point_on_line"] = on_line if options.points_on_lines else Pairs.empty()
     vertical = vertical_of(scene)
     found |= angles_between(planes, directions, (found["line_on_plane"], along), vertical, level)
     return Structure(

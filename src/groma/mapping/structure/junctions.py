@@ -18,7 +18,7 @@ from groma.estimators.membership import Candidates, memberships
 from groma.gates import SEARCH, STRUCTURE, chi_square_gate, gate
 from groma.geometry.algebra import dot, norm, unit
 from groma.mapping.groups import distinct_pairs
-from groma.mapping.structure.relations import Landmarks, Pairs
+from groma.mapping.structure.relations import Landmarks, Pairs, samples_of
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def meetings(marks: Landmarks, level: float, least: float) -> Pairs:
     """Pairs (first, second) of usable lines that meet, the smaller number first."""
     rows = np.flatnonzero(marks.line_usable)
     if len(rows) < 2:
-        return Pairs.none()
+        return Pairs.empty()
     pairs = rows[_neighbours(marks.segments[rows], marks.line_pixel[rows])]
     first, second = pairs.T
     ends = marks.segments
@@ -66,7 +66,7 @@ def meetings(marks: Landmarks, level: float, least: float) -> Pairs:
     # Lines that both go on cross in front of each other, or on a surface.
     kept = np.flatnonzero(near & (np.maximum(*gap) > -GATES.reach_px))
     if len(kept) == 0:
-        return Pairs.none()
+        return Pairs.empty()
     variance = np.zeros(len(kept))
     for line, place in ((first[kept], share[0][kept]), (second[kept], share[1][kept])):
         slope = np.einsum("nai,ni->na", marks.own_line_noise.across[line], normal[kept])
@@ -104,10 +104,7 @@ def _neighbours(segments: FloatArray, pixel: FloatArray) -> IntArray:
     """Pairs (M, 2) of segments, one of which ends near the other; the smaller number first."""
     length = norm(segments[:, 1] - segments[:, 0])
     count = np.clip(np.ceil(length / (GATES.reach_px * pixel)), 2, GATES.max_samples).astype(np.int64)
-    owner = np.repeat(np.arange(len(segments)), count)
-    number = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
-    share = number / (count[owner] - 1)
-    samples = segments[owner, 0] + share[:, None] * (segments[owner, 1] - segments[owner, 0])
+    samples, owner = samples_of(segments, count)
     ends = segments.reshape(-1, 3)
     number = min(GATES.nearest, len(samples))
     _, index = nearest(kd_tree(samples), ends, number)

@@ -13,6 +13,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
+from groma._rows import Rows, column, numbered
 from groma._trees import kd_tree, nearest
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.association import inlier_probability
@@ -73,26 +74,17 @@ class Landmarks:
         return (points, self.points[points]), (lines, self.segments[lines])
 
 
-@dataclass(frozen=True)
-class Pairs:
+@dataclass(frozen=True, eq=False)
+class Pairs(Rows):
     """Landmarks and the structures they belong to."""
 
     #: (M, 2) number of the landmark, number of the structure.
-    pairs: IntArray
+    pairs: IntArray = column(2, dtype=np.int64)
     #: (M,) probability that the landmark is no clutter.
-    probability: FloatArray
+    probability: FloatArray = column()
     #: (M,) deviation from the structure that is usual for such landmarks, pixels; 0 where their noise explains it.
     #: Of pairs of planes and directions: that of the angle, radians.
-    deviation: FloatArray
-
-    @staticmethod
-    def none() -> Pairs:
-        """No pairs."""
-        return Pairs(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0))
-
-    def take(self, rows: IntArray | BoolArray) -> Pairs:
-        """Return some of the pairs."""
-        return Pairs(self.pairs[rows], self.probability[rows], self.deviation[rows])
+    deviation: FloatArray = column()
 
     def counts(self, num: int) -> IntArray:
         """(num,) landmarks of each structure."""
@@ -103,6 +95,13 @@ class Pairs:
         structure = new[self.pairs[:, 1]]
         pairs = np.column_stack([self.pairs[:, 0], structure])
         return Pairs(pairs, self.probability, self.deviation).take(structure >= 0)
+
+
+def samples_of(segments: FloatArray, count: IntArray) -> tuple[FloatArray, IntArray]:
+    """Places (N, 3) on segments from end to end, so many on each (L,), and the segment of each."""
+    owner, number = numbered(count)
+    share = number / (count[owner] - 1)
+    return segments[owner, 0] + share[:, None] * (segments[owner, 1] - segments[owner, 0]), owner
 
 
 def spacings(points: FloatArray, segments: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -126,7 +125,7 @@ def on_planes(
     """
     num = len(found)
     if num == 0:
-        return Pairs.none(), Pairs.none()
+        return Pairs.empty(), Pairs.empty()
     near = partial(_near_plane, marks, found, GATES.layer, {} if known is None else known)
     parts = list(zip(*map_in_threads(near, range(num)), strict=True))
     points, lines = np.concatenate(parts[0]), np.concatenate(parts[1])
@@ -242,7 +241,7 @@ def on_lines(marks: Landmarks, level: float, least: float) -> Pairs:
     rows = np.flatnonzero(marks.line_usable)
     tested = np.flatnonzero(marks.point_usable)
     if len(rows) == 0 or len(tested) == 0:
-        return Pairs.none()
+        return Pairs.empty()
     pairs = _near_segments(marks.points[tested], marks.segments[rows])
     point, line = tested[pairs[:, 0]], rows[pairs[:, 1]]
     start, along = marks.segments[line, 0], marks.segments[line, 1] - marks.segments[line, 0]
@@ -309,10 +308,7 @@ def _near_segments(points: FloatArray, segments: FloatArray) -> IntArray:
     length = norm(segments[:, 1] - segments[:, 0])
     number = max(GATES.num_samples[0], GATES.num_samples[1] * len(segments))
     count = np.clip(np.ceil(number * length / max(length.sum(), 1e-300)), 3, 512).astype(np.int64)
-    owner = np.repeat(np.arange(len(segments)), count)
-    first = np.repeat(np.cumsum(count) - count, count)
-    share = (np.arange(len(owner)) - first) / (count[owner] - 1)
-    samples = segments[owner, 0] + share[:, None] * (segments[owner, 1] - segments[owner, 0])
+    samples, owner = samples_of(segments, count)
     number = min(GATES.num_nearest, len(samples))
     _, index = nearest(kd_tree(samples), points, number)
     return distinct_pairs(np.repeat(np.arange(len(points)), number), owner[index].ravel())[0]

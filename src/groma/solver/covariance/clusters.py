@@ -48,26 +48,16 @@ def clustered(covariances: Covariances, variable: Variable, landmarks: str, clus
     return sums.T @ sums * (count / max(count - size, 1))
 
 
-def rows_of_kept(covariances: Covariances) -> dict[str, IntArray]:
-    """Return which unknowns (count, dof) of the reduced system the kept variables are, by group."""
-    layout, rows = covariances._layout, {}
-    groups = layout.problem.variables
-    for name, (c, member) in covariances._kept.items():
-        kept, block = layout.kept[c], member.blocks(np.arange(len(groups[name])))[:, None]
-        rows[name] = kept.start + block * kept.width + member.offset + np.arange(groups[name].manifold.dof)
-    return rows
-
-
 def with_kept(covariances: Covariances, group: str, index: int) -> dict[str, FloatArray]:
     """Return the covariances (count, dof, own dof) of the kept variables of all groups with one of them."""
-    layout, rows = covariances._layout, rows_of_kept(covariances)
+    layout = covariances._layout
     groups = layout.problem.variables
     own = groups[group].manifold.dof
     R = np.zeros((layout.num_kept_unknowns, own))
-    R[rows[group][index], np.arange(own)] = 1.0
-    free = ~np.concatenate(covariances._held)[:, None]
+    R[layout.unknowns[group][index], np.arange(own)] = 1.0
+    free = ~covariances._held[:, None]
     solved = covariances._solve(R * free) * free
-    found = {name: solved[at] for name, at in rows.items()}
+    found = {name: solved[at] for name, at in layout.unknowns.items()}
     for tied in covariances._divided.tied:  # the eliminated part of their group is not included
         found.setdefault(tied.group, np.zeros((int((~tied.is_tied).sum()), groups[tied.group].manifold.dof, own)))
     return covariances._divided.join(found)

@@ -29,9 +29,8 @@ from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations
 from groma.problem.problem import Problem
 from groma.problem.residuals import jacobians_of, root_matrices, squared_norms
-from groma.solver.linear.blocks import Blocks, multiply
+from groma.solver.linear.blocks import Blocks, multiply, split
 from groma.solver.linear.schur import ReducedSystem
-from groma.solver.steps import Step
 
 #: A world motion counts as free if its cost is below this fraction of the one expected from its size.
 FREE_TOLERANCE = 1e-9
@@ -48,8 +47,8 @@ class FreeMotions:
     combinations: FloatArray
     center: FloatArray
     length: float
-    #: Increments by kept class (unknowns, k) and by eliminated group (unknowns, k), flat, in solver order.
-    kept: list[FloatArray]
+    #: Increments of the kept unknowns (unknowns, k), and by eliminated group (unknowns, k), flat, in solver order.
+    kept: FloatArray
     landmarks: list[FloatArray]
 
     @property
@@ -58,17 +57,12 @@ class FreeMotions:
         return self.combinations.shape[1]
 
 
-def held_coordinates(layout: Layout) -> tuple[list[BoolArray], list[BoolArray]]:
-    """Return which unknowns are held constant, by kept class and by eliminated group, flat, in solver order."""
-    kept, landmarks = [], []
-    for c in layout.kept:
-        held = np.zeros((c.count, c.width), bool)
-        for member in c.members:
-            free = layout.problem.variables[member.group].free_coordinates()
-            if free is not None:
-                blocks = member.blocks(np.arange(len(free)))
-                held[blocks, member.offset : member.offset + member.dof] = ~free
-        kept.append(held.reshape(-1))
+def held_coordinates(layout: Layout) -> tuple[BoolArray, list[BoolArray]]:
+    """Return which unknowns are held constant: of the kept ones, and by eliminated group, flat, in solver order."""
+    kept, landmarks = np.zeros(layout.num_kept_unknowns, bool), []
+    for name, at in layout.unknowns.items():
+        free = layout.problem.variables[name].free_coordinates()
+        kept[at] = False if free is None else ~free
     for e in layout.eliminated:
         free = layout.problem.variables[e.group].free_coordinates()
         landmarks.append(np.zeros(e.count * e.dof, bool) if free is None else ~free[e.order].reshape(-1))
@@ -79,11 +73,14 @@ def free_motions(layout: Layout, equations: NormalEquations, system: ReducedSyst
     """Find the combinations of the seven world motions that move no held coordinate and cost nothing."""
     center, length = middle_and_extent(layout.problem)
     motions = world_motions(layout.problem, center, length)
-    kept, landmarks = _by_layout(layout, motions)
+    kept = np.zeros((layout.num_kept_unknowns, 7))
+    for name, at in layout.unknowns.items():
+        kept[at] = motions[name].transpose(1, 2, 0)
+    landmarks = [motions[e.group][:, e.order].transpose(1, 2, 0).reshape(-1, 7) for e in layout.eliminated]
     held_kept, held_landmarks = held_coordinates(layout)
     combinations = np.eye(7)
-    held = [part[mask] for part, mask in zip(kept + landmarks, held_kept + held_landmarks, strict=True)]
-    stuck = np.concatenate([np.zeros((0, 7)), *held])
+    stuck = [kept[held_kept], *(part[mask] for part, mask in zip(landmarks, held_landmarks, strict=True))]
+    stuck = np.concatenate(stuck)
     if len(stuck):
         combinations = unmoved(stuck, length)
     gram, size = _costs(layout, equations, system, kept, landmarks)
@@ -96,13 +93,7 @@ def free_motions(layout: Layout, equations: NormalEquations, system: ReducedSyst
         # an eigenvector is free if its cost is small for its size
         expected = np.einsum("ik,ij,jk->k", vectors, size * scale[:, None] * scale, vectors)
         combinations = combinations @ (scale[:, None] * vectors)[:, values < FREE_TOLERANCE * expected]
-    return FreeMotions(
-        combinations,
-        center,
-        length,
-        [part @ combinations for part in kept],
-        [part @ combinations for part in landmarks],
-    )
+    return FreeMotions(combinations, center, length, kept @ combinations, [part @ combinations for part in landmarks])
 
 
 def constrained(layout: Layout, S: Blocks, G: FloatArray) -> Blocks:
@@ -112,22 +103,19 @@ def constrained(layout: Layout, S: Blocks, G: FloatArray) -> Blocks:
     """
     left = np.eye(G.shape[1])
     S = {pair: blocks.copy() if pair[0] == pair[1] else blocks for pair, blocks in S.items()}
-    kinds = [layout.problem.variables[c.members[0].group].manifold.kind for c in layout.kept]
+    kinds = layout.kinds
     for chosen in (("pose",), tuple(set(kinds) - {"pose"})):
         while left.shape[1]:
             strongest, where = 1e-6 * float(np.linalg.norm(G, axis=1).max(initial=0.0)), None
             for c, kept in enumerate(layout.kept):
                 if kinds[c] in chosen:
-                    part = G[kept.start : kept.start + kept.count * kept.width].reshape(kept.count, kept.width, -1)
-                    strength = np.linalg.norm(part @ left, axis=(1, 2))
+                    strength = np.linalg.norm(kept.blocks_of(G) @ left, axis=(1, 2))
                     if strength.max() > strongest:
                         strongest, where = float(strength.max()), (c, int(strength.argmax()))
             if where is None:
                 break
             c, block = where
-            kept = layout.kept[c]
-            first = kept.start + block * kept.width
-            U, values, Vt = np.linalg.svd(G[first : first + kept.width] @ left)
+            U, values, Vt = np.linalg.svd(layout.kept[c].blocks_of(G)[block] @ left)
             held = values > 0.1 * values[0]
             C = U[:, : len(values)][:, held]
             S[c, c][block] += C @ C.T
@@ -154,19 +142,6 @@ def middle_and_extent(problem: Problem, most_points: int | None = None) -> tuple
     center = np.median(place, axis=0)
     length = float(np.median(np.linalg.norm(place - center, axis=1)))
     return center, length if length > 0 else 1.0
-
-
-def _by_layout(layout: Layout, motions: dict[str, FloatArray]) -> tuple[list[FloatArray], list[FloatArray]]:
-    """Motions (7, count, dof) of the groups, as (unknowns, 7) by kept class and by eliminated group."""
-    kept = []
-    for c in layout.kept:
-        blocks = np.zeros((c.count, c.width, 7))
-        for member in c.members:
-            part = motions[member.group].transpose(1, 2, 0)
-            blocks[member.blocks(np.arange(len(part))), member.offset : member.offset + member.dof] = part
-        kept.append(blocks.reshape(-1, 7))
-    landmarks = [motions[e.group][:, e.order].transpose(1, 2, 0).reshape(-1, 7) for e in layout.eliminated]
-    return kept, landmarks
 
 
 def unmoved(motions: FloatArray, length: float) -> FloatArray:
@@ -213,11 +188,7 @@ def _costs_of_incidences(problem: Problem, motions: dict[str, FloatArray]) -> Fl
 
 
 def _costs(
-    layout: Layout,
-    equations: NormalEquations,
-    system: ReducedSystem,
-    kept: list[FloatArray],
-    landmarks: list[FloatArray],
+    layout: Layout, equations: NormalEquations, system: ReducedSystem, kept: FloatArray, landmarks: list[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
     """Return J^T J restricted to the motions, and its diagonal restricted to them, both (7, 7)."""
     direct = {
@@ -226,14 +197,14 @@ def _costs(
     }
     gram, size = np.zeros((7, 7)), np.zeros((7, 7))
     for k in range(7):
-        step = Step([np.ascontiguousarray(part[:, k]) for part in kept], [])
-        for part, product in zip(kept, multiply(layout, direct, step.kept), strict=True):
+        step = split(layout, np.ascontiguousarray(kept[:, k]))
+        for part, product in zip(split(layout, kept), multiply(layout, direct, step), strict=True):
             gram[:, k] += part.T @ product
-        for part, product in zip(landmarks, system.incident_products(step.kept), strict=True):
+        for part, product in zip(landmarks, system.incident_products(step), strict=True):
             cross = part.T @ product
             gram[:, k] += cross
             gram[k] += cross
-    for c, part in enumerate(kept):
+    for c, part in enumerate(split(layout, kept)):
         size += part.T @ (system.diagonal(c).reshape(-1)[:, None] * part)
     for e, part in enumerate(landmarks):
         dof = layout.eliminated[e].dof

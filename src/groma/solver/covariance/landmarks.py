@@ -127,8 +127,7 @@ class Landmarks:
         eliminated = self._layout.eliminated[e]
         out = np.zeros((eliminated.count, eliminated.dof, X.shape[1]))
         for c, incidences in eliminated.incidences.items():
-            kept = self._layout.kept[c]
-            blocks = X[kept.start : kept.start + kept.count * kept.width].reshape(kept.count, kept.width, -1)
+            blocks = self._layout.kept[c].blocks_of(X)
             landmark = np.repeat(np.arange(eliminated.count), np.diff(incidences.pointer))
             np.add.at(out, landmark, self.incidence(e, c) @ blocks[incidences.block])
         return out

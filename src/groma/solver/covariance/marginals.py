@@ -137,9 +137,9 @@ class Covariances:
         self._sigma: Blocks = {}
         if layout.kept:
             self._system.assemble(0.0)
-            seen = [self._system.diagonal(c).reshape(-1) != 0.0 for c in range(len(layout.kept))]
+            seen = self._system.flat_diagonal() != 0.0
             cancelled, moved = hold_cancelled_coordinates(self._system)
-            self._unseen = [~(a | held) | b for a, held, b in zip(seen, self._held, cancelled, strict=True)]
+            self._unseen = ~(seen | self._held) | cancelled
             for e, open_ in enumerate(self._undetermined if moved.any() else ()):
                 open_ |= self._landmarks.moved(e, moved, LOOSE)
             with one_blas_thread():
@@ -152,8 +152,7 @@ class Covariances:
         motions, G = None, np.zeros((layout.num_kept_unknowns, 0))
         if gauge == "inner":
             motions = self.motions = free_motions(layout, self._equations, self._system)
-            G = np.concatenate(motions.kept)
-            G[np.concatenate(self._held) | np.concatenate(self._unseen)] = 0.0
+            G = np.where((self._held | self._unseen)[:, None], 0.0, motions.kept)
             S = constrained(layout, S, G * self._size[:, None])
         inverse = self._inverse(S)
         if inverse is None:
@@ -178,7 +177,7 @@ class Covariances:
     def _without_open_variables(self, S: Blocks, G: FloatArray, gauge: str) -> Blocks:
         """Hold the unobservable variables, and note them and the landmarks they move."""
         layout = self._layout
-        known = [held | unseen for held, unseen in zip(self._held, self._unseen, strict=True)]
+        known = self._held | self._unseen
         S, unobservable = hold_unobservable_blocks(self._equations, S, self._size, known, G)
         modes = zero_modes(layout, self._fronts, S)
         null = modes.vectors[:, : modes.num_null]
@@ -187,9 +186,7 @@ class Covariances:
             if free or loses_the_cameras(layout, modes):
                 raise deficiency(layout, modes, free)
             S = constrained(layout, S, null)
-        loose = np.any(np.abs(null) > LOOSE, axis=1)
-        for c, kept in enumerate(layout.kept):
-            self._unseen[c] |= unobservable[c] | loose[kept.start : kept.start + kept.count * kept.width]
+        self._unseen |= unobservable | np.any(np.abs(null) > LOOSE, axis=1)
         for e in range(len(self._undetermined)):
             self._undetermined[e] |= self._landmarks.moved(e, null / self._size[:, None], LOOSE)
         return S
@@ -214,8 +211,7 @@ class Covariances:
         out = np.zeros((len(index), dof, dof))
         for at, part, rows in self._divided.places(group, index):
             if part in self._kept:
-                c, member = self._kept[part]
-                out[at] = self._of_kept(c, member.blocks(rows), slice(member.offset, member.offset + dof))
+                out[at] = self._of_kept(part, rows)
             elif part in self._eliminated:
                 out[at] = self._of_landmarks(self._eliminated[part], self._position[part][rows])
             else:
@@ -231,16 +227,14 @@ class Covariances:
             raise InputError(f"Group {group!r} has variables 0 to {len(variables) - 1}; asked for {rows.tolist()[:5]}.")
         return rows
 
-    def _of_kept(self, c: int, blocks: IntArray, part: slice) -> FloatArray:
-        kept = self._layout.kept[c]
-        sigma = self._sigma[c, c][blocks].copy()
+    def _of_kept(self, part: str, rows: IntArray) -> FloatArray:
+        (c, member), at = self._kept[part], self._layout.unknowns[part][rows]
+        sigma = self._sigma[c, c][member.blocks(rows)][:, member.columns, member.columns]
         if self._datum is not None:
-            rows = kept.start + blocks[:, None] * kept.width + np.arange(kept.width)
-            sigma += self._datum.correction(self._datum.G[rows], self._datum.A[rows])
-        held = self._held[c].reshape(kept.count, kept.width)[blocks]
-        unseen = self._unseen[c].reshape(kept.count, kept.width)[blocks]
-        sigma = np.where(held[:, :, None] | held[:, None, :], 0.0, sigma)[:, part, part]
-        return np.where(unseen[:, part].any(axis=1)[:, None, None], np.nan, sigma)
+            sigma = sigma + self._datum.correction(self._datum.G[at], self._datum.A[at])
+        held = self._held[at]
+        sigma = np.where(held[:, :, None] | held[:, None, :], 0.0, sigma)
+        return np.where(self._unseen[at].any(axis=1)[:, None, None], np.nan, sigma)
 
     def _of_landmarks(self, e: int, landmarks: IntArray) -> FloatArray:
         dof = self._layout.eliminated[e].dof
@@ -265,10 +259,7 @@ class Covariances:
             variables = self._layout.problem.variables[part]
             free = variables.free_coordinates()
             return np.arange(len(variables)) if free is None else np.flatnonzero(free.any(axis=1))
-        c, member = self._kept[part]
-        blocks = member.blocks(np.arange(len(self._layout.problem.variables[part])))
-        unseen = self._unseen[c].reshape(-1, self._layout.kept[c].width)[blocks]
-        return np.flatnonzero(unseen[:, member.offset : member.offset + member.dof].any(axis=1))
+        return np.flatnonzero(self._unseen[self._layout.unknowns[part]].any(axis=1))
 
     def in_datum(self, increments: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """Free increments (count, dof) of all groups from their common motion: the errors that :meth:`of` describes.
@@ -278,15 +269,9 @@ class Covariances:
         moved = {name: np.array(part, dtype=np.float64) for name, part in increments.items()}
         if self._datum is None:
             return moved
-        layout, datum, views = self._layout, self._datum, []  # (group, rows of G, rows of D)
+        layout, datum = self._layout, self._datum
         moved = self._divided.divide(moved)
-        for name, (c, member) in self._kept.items():
-            kept = layout.kept[c]
-            at = slice(kept.start, kept.start + kept.count * kept.width)
-            G, D = datum.G[at].reshape(kept.count, kept.width, -1), datum.D[at].reshape(kept.count, kept.width)
-            rows = member.blocks(np.arange(len(layout.problem.variables[name])))
-            part = slice(member.offset, member.offset + member.dof)
-            views.append((name, G[rows, part], D[rows, part]))
+        views = [(name, datum.G[at], datum.D[at]) for name, at in layout.unknowns.items()]
         for e, eliminated in enumerate(layout.eliminated):
             rows = self._position[eliminated.group]
             shape = (eliminated.count, eliminated.dof)
@@ -328,24 +313,20 @@ class Covariances:
                 size = places[variable].stop
         R, out, broken = np.zeros((layout.num_kept_unknowns, size)), np.zeros((size, size)), np.zeros(size, bool)
         G, A = (np.zeros((size, 0 if datum is None else datum.G.shape[1])) for _ in range(2))
-        held = np.concatenate([np.zeros(0, bool), *self._held])
         for (group, i), at in places.items():
             broken[at] = i in self.undetermined(group)
             ((_, part, row),) = self._divided.places(group, np.array([i]))
             if part in self._kept:
-                c, member = self._kept[part]
-                first = layout.kept[c].start + int(member.blocks(row)[0]) * layout.kept[c].width + member.offset
-                rows = slice(first, first + member.dof)
-                R[rows, at] = np.diag(np.where(held[rows], 0.0, 1.0))
+                rows = layout.unknowns[part][row[0]]
+                R[rows, at] = np.diag(np.where(self._held[rows], 0.0, 1.0))
                 if datum is not None:
                     G[at], A[at] = datum.G[rows], datum.A[rows]
             elif part in self._eliminated:
                 e, p = self._eliminated[part], int(self._position[part][row[0]])
                 for c, incidences in layout.eliminated[e].incidences.items():
-                    kept, B = layout.kept[c], self._landmarks.incidence(e, c)
-                    for k in range(incidences.pointer[p], incidences.pointer[p + 1]):
-                        first = kept.start + int(incidences.block[k]) * kept.width
-                        R[first : first + kept.width, at] += B[k].T
+                    own = slice(incidences.pointer[p], incidences.pointer[p + 1])
+                    B = self._landmarks.incidence(e, c)[own]
+                    layout.kept[c].blocks_of(R)[incidences.block[own], :, at] += np.swapaxes(B, 1, 2)
                 out[at, at] -= self._landmarks.inverses(e)[p]
                 if datum is not None:
                     rows = slice(p * layout.eliminated[e].dof, (p + 1) * layout.eliminated[e].dof)

@@ -108,7 +108,8 @@ def _angle(covariances: Covariances, first: Variable, second: Variable, kinds, a
     derived = covariances.derived(opening, (first, second))
     sigma = _length_sigma(derived.value, derived.covariance)
     cosine = abs(float(u @ v))
-    if cosine < 0.7:  # the sine turns flat near a right angle; the cosine does not
+    # derived from 45 degrees: beyond, the sine is the flatter one, towards a right angle
+    if cosine < 0.7:
         dot = covariances.derived(
             lambda x, y: x[a] @ y[b] / np.linalg.norm(x[a]) / np.linalg.norm(y[b]), (first, second)
         )

@@ -16,7 +16,7 @@ import numpy as np
 
 from groma._typing import BoolArray, FloatArray
 from groma.errors import ProblemError
-from groma.problem.layout import KeptClass, Layout
+from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations
 from groma.solver.linear.blocks import Blocks
 from groma.solver.linear.elimination import LANDMARK_TOLERANCE, scaled_blocks
@@ -31,16 +31,17 @@ MAX_MODES = 1024
 _DIAGNOSIS = "The diagnosis (--diagnosis; in Python groma.solver.observability.diagnosis.diagnose)"
 
 
-def hold_cancelled_coordinates(system: ReducedSystem) -> tuple[list[BoolArray], FloatArray]:
+def hold_cancelled_coordinates(system: ReducedSystem) -> tuple[BoolArray, FloatArray]:
     """Hold the coordinates of which the elimination of landmarks left rounding alone; blocks of S are changed.
 
     Returns
     -------
     tuple
-        By kept class which unknowns (count * width,) they are; and their moves (unknowns, k) by what makes the diagonal
-        of H one, those of a block in columns of their own.
+        Which unknowns they are; and their moves (unknowns, k) by what makes the diagonal of H one, those of a block in
+        columns of their own.
     """
-    layout, found = system.layout, []
+    layout = system.layout
+    found = np.zeros(layout.num_kept_unknowns, bool)
     moves = np.zeros((layout.num_kept_unknowns, max(kept.width for kept in layout.kept)))
     for c, kept in enumerate(layout.kept):
         direct, S, steps = system.diagonal(c), system.S[c, c][: kept.count], np.arange(kept.width)
@@ -48,13 +49,13 @@ def hold_cancelled_coordinates(system: ReducedSystem) -> tuple[list[BoolArray], 
         S[:, steps, steps] += np.where(cancelled, direct, 0.0)
         rows = np.flatnonzero(cancelled)
         moves[kept.start + rows, rows % kept.width] = 1.0 / np.sqrt(direct.reshape(-1)[rows])
-        found.append(cancelled.reshape(-1))
+        kept.blocks_of(found)[:] = cancelled
     return found, moves
 
 
 def hold_unobservable_blocks(
-    equations: NormalEquations, S: Blocks, size: FloatArray, known: list[BoolArray], G: FloatArray
-) -> tuple[Blocks, list[BoolArray]]:
+    equations: NormalEquations, S: Blocks, size: FloatArray, known: BoolArray, G: FloatArray
+) -> tuple[Blocks, BoolArray]:
     """Hold the directions in which planes, directions and other kept landmarks move no residual.
 
     Parameters
@@ -65,35 +66,33 @@ def hold_unobservable_blocks(
         Scaled system.
     size : (unknowns,) float
         What the unknowns were multiplied by.
-    known
-        By kept class: which unknowns (count * width,) are held already.
+    known : (unknowns,) bool
+        Which are held already.
     G : (unknowns, k) float
         Free motions of the scene, which are held elsewhere.
 
     Returns
     -------
     tuple
-        The system, and by kept class which unknowns are unobservable.
+        The system, and which unknowns are unobservable.
     """
-    S, unobservable = dict(S), [np.zeros(len(part), bool) for part in known]
-    for c, kept in enumerate(equations.layout.kept):
-        if _kind(equations.layout, kept) in ("pose", "intrinsics"):
+    S, unobservable = dict(S), np.zeros(len(known), bool)
+    for c, (kept, kind) in enumerate(zip(equations.layout.kept, equations.layout.kinds, strict=True)):
+        if kind in ("pose", "intrinsics"):
             continue
-        shape = kept.count, kept.width
-        H = equations.H[c, c][: kept.count * kept.width**2].reshape(*shape, kept.width)
+        H = equations.H[c, c][: kept.count * kept.width**2].reshape(kept.count, kept.width, kept.width)
         H, own_size = scaled_blocks(H)
-        H[:, np.arange(kept.width), np.arange(kept.width)] += known[c].reshape(shape)
+        H[:, np.arange(kept.width), np.arange(kept.width)] += kept.blocks_of(known)
         values, vectors = np.linalg.eigh(H)
-        at = slice(kept.start, kept.start + kept.count * kept.width)
-        carried = np.any(G[at].reshape(kept.count, -1) != 0.0, axis=1)
+        carried = np.any(kept.blocks_of(G) != 0.0, axis=(1, 2))
         null = (values < LANDMARK_TOLERANCE) & ~carried[:, None]
         if null.any():
-            X = vectors * null[:, None, :] * (size[at].reshape(shape) / own_size)[:, :, None]
+            X = vectors * null[:, None, :] * (kept.blocks_of(size) / own_size)[:, :, None]
             X /= np.maximum(np.linalg.norm(X, axis=1, keepdims=True), 1e-300)
             blocks = S[c, c].copy()
             blocks[: kept.count] += X @ np.swapaxes(X, 1, 2)
             S[c, c] = blocks
-            unobservable[c] = np.any(np.abs(X) > LOOSE, axis=2).reshape(-1)
+            kept.blocks_of(unobservable)[:] = np.any(np.abs(X) > LOOSE, axis=2)
     return S, unobservable
 
 
@@ -112,7 +111,7 @@ def loses_the_cameras(layout: Layout, modes: Modes) -> bool:
     if modes.num_null == len(modes.values):
         return True
     loose = np.any(np.abs(modes.vectors[:, : modes.num_null]) > LOOSE, axis=1)
-    poses = np.concatenate([np.full(c.count * c.width, _kind(layout, c) == "pose") for c in layout.kept])
+    poses = np.repeat([kind == "pose" for kind in layout.kinds], [c.count * c.width for c in layout.kept])
     return bool(poses.any() and loose[poses].mean() > MAX_LOOSE)
 
 
@@ -134,16 +133,11 @@ def deficiency(layout: Layout, modes: Modes, num_free: int) -> ProblemError:
         )
     null: BoolArray = np.asarray(np.abs(modes.vectors[:, : modes.num_null]) > LOOSE)
     moved, total = 0, 0
-    for kept in layout.kept:
-        if _kind(layout, kept) == "pose":
-            part = null[kept.start : kept.start + kept.count * kept.width].reshape(kept.count, -1)
-            moved, total = moved + int(part.any(axis=1).sum()), total + kept.count
+    for kept, kind in zip(layout.kept, layout.kinds, strict=True):
+        if kind == "pose":
+            moved, total = moved + int(kept.blocks_of(null).any(axis=(1, 2)).sum()), total + kept.count
     what = f"; {moved} of {total} poses are not determined" if moved else ""
     return ProblemError(
         f"The normal equations are rank deficient by {number}{what}. "
         f"{_DIAGNOSIS} names what is not determined; leave it out, or add observations or measurements of it."
     )
-
-
-def _kind(layout: Layout, kept: KeptClass) -> str:
-    return layout.problem.variables[kept.members[0].group].manifold.kind

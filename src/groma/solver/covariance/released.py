@@ -22,7 +22,6 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.factors.contract import Factor
 from groma.problem.residuals import jacobians_of, root_matrices, squared_norms
-from groma.solver.covariance.clusters import rows_of_kept
 from groma.solver.covariance.marginals import Covariances
 from groma.solver.covariance.s_transform import Transformation
 
@@ -39,19 +38,18 @@ def released(covariances: Covariances, held: Factor) -> Covariances:
         holds, that stays held.
     """
     layout, problem = covariances._layout, covariances.problem
-    rows = rows_of_kept(covariances)
     j = np.zeros((layout.num_kept_unknowns, 1))
     for (_, ref), block in zip(held.references(), jacobians_of(held, problem.variables).values(), strict=True):
-        np.add.at(j[:, 0], rows[ref.group][ref.index[0]], (root_matrices(held) @ block)[0, 0])
-    j[np.concatenate(covariances._held)] = 0.0
+        np.add.at(j[:, 0], layout.unknowns[ref.group][ref.index[0]], (root_matrices(held) @ block)[0, 0])
+    j[covariances._held] = 0.0
     moved = covariances._solve(j)
     variance = float((j.T @ moved)[0, 0])
     if not variance > 0.0 or covariances._datum is not None:
         return covariances
     g = moved / variance
-    g[np.concatenate(covariances._held)] = 0.0
+    g[covariances._held] = 0.0
     landmarks = [covariances._landmarks.followed(e, g) for e in range(len(layout.eliminated))]
-    found = {name: g[at, 0] for name, at in rows.items()}
+    found = {name: g[at, 0] for name, at in layout.unknowns.items()}
     for e, eliminated in enumerate(layout.eliminated):
         found[eliminated.group] = landmarks[e][covariances._position[eliminated.group], :, 0]
     motion = covariances._divided.join(found)

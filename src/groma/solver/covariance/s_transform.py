@@ -94,9 +94,7 @@ def transformation(
             for c, incidences in eliminated.incidences.items():
                 landmark = np.repeat(np.arange(eliminated.count), np.diff(incidences.pointer))
                 parts = np.swapaxes(landmarks.incidence(e, c), 1, 2) @ weighted[landmark]
-                kept = layout.kept[c]
-                view = target[kept.start : kept.start + kept.count * kept.width]
-                np.add.at(view.reshape(kept.count, kept.width, -1), incidences.block, parts)
+                np.add.at(layout.kept[c].blocks_of(target), incidences.block, parts)
     Y = solve(target)
     Y_landmarks = [part + landmarks.followed(e, Y) for e, part in enumerate(local)]
     weight = G.T @ (D_kept[:, None] * G)
@@ -133,17 +131,12 @@ def datum_weights(
     """
     kept = np.zeros(layout.num_kept_unknowns)
     landmarks = [np.zeros(e.count * e.dof) for e in layout.eliminated]
-    known = [m.group for c in layout.kept for m in c.members] + [e.group for e in layout.eliminated]
+    known = [*layout.unknowns, *(e.group for e in layout.eliminated)]
     for name in datum or {}:
         if name not in known:
             raise InputError(f"The datum names {name!r}; the groups with free variables are {sorted(known)}.")
-    for c in layout.kept:
-        blocks = kept[c.start : c.start + c.count * c.width].reshape(c.count, c.width)
-        for member in c.members:
-            value = 1.0 if datum is None else datum.get(member.group, 0.0)
-            weight = weights_of(layout.problem.variables[member.group], member.group, value)
-            rows = member.blocks(np.arange(len(weight)))
-            blocks[rows, member.offset : member.offset + member.dof] = weight
+    for name, at in layout.unknowns.items():
+        kept[at] = weights_of(layout.problem.variables[name], name, 1.0 if datum is None else datum.get(name, 0.0))
     for e, eliminated in enumerate(layout.eliminated):
         value = 0.0 if datum is None else datum.get(eliminated.group, 0.0)
         weight = weights_of(layout.problem.variables[eliminated.group], eliminated.group, value)

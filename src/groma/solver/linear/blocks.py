@@ -54,4 +54,9 @@ def products(layout: Layout, blocks: Blocks, x: list[FloatArray], y: list[FloatA
 
 def split(layout: Layout, x: FloatArray) -> list[FloatArray]:
     """Return the parts of a flat vector by class, without a copy."""
-    return [x[c.start : c.start + c.count * c.width] for c in layout.kept]
+    return [x[c.unknowns] for c in layout.kept]
+
+
+def product(layout: Layout, blocks: Blocks, x: FloatArray) -> FloatArray:
+    """Return the product of a symmetric block matrix, given by its upper blocks, with a flat vector."""
+    return np.concatenate(multiply(layout, blocks, split(layout, np.ascontiguousarray(x))))

@@ -14,7 +14,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.problem.layout import Layout
-from groma.solver.linear.blocks import Blocks, multiply
+from groma.solver.linear.blocks import Blocks, product
 from groma.solver.linear.fronts import Fronts
 
 #: Eigenvalues of the scaled system below this count as zero: rounding reaches about 1e-13.
@@ -44,13 +44,13 @@ def scaled(layout: Layout, S: Blocks) -> tuple[Blocks, FloatArray]:
     size = np.ones(layout.num_kept_unknowns)
     for c, kept in enumerate(layout.kept):
         diagonal = np.einsum("nii->ni", S[c, c][: kept.count]).reshape(-1)
-        size[kept.start : kept.start + len(diagonal)] = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+        size[kept.unknowns] = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     return divided(layout, S, size), size
 
 
 def divided(layout: Layout, S: Blocks, size: FloatArray) -> Blocks:
     """Divide every block by the sizes of its rows and of its columns."""
-    parts = [size[c.start : c.start + c.count * c.width].reshape(c.count, c.width) for c in layout.kept]
+    parts = [kept.blocks_of(size) for kept in layout.kept]
     result = {}
     for (a, b), values in S.items():
         rows, columns = layout.blocks[a, b]
@@ -65,12 +65,12 @@ def smallest(layout: Layout, fronts: Fronts, S: Blocks, count: int = MODES) -> M
     X = np.linalg.qr(np.random.default_rng(0).normal(size=(n, count)))[0]
     shift = SHIFT
     while not fronts.factorize(_shifted(layout, S, shift)):
-        shift *= 10.0
+        shift *= 10.0  # cost: accuracy, see above
         if shift > MAX_SHIFT:  # not a positive matrix at all: a degenerate linearisation
             return Modes(np.zeros(0), np.zeros((n, 0)))
     for _ in range(ROUNDS if count < n else 1):
         X = np.linalg.qr(fronts.solve(X))[0]
-    SX = np.column_stack([_product(layout, S, X[:, k]) for k in range(count)])
+    SX = np.column_stack([product(layout, S, X[:, k]) for k in range(count)])
     values, vectors = np.linalg.eigh(0.5 * (X.T @ SX + SX.T @ X))
     return Modes(values, X @ vectors)
 
@@ -83,8 +83,3 @@ def _shifted(layout: Layout, S: Blocks, shift: float) -> Blocks:
         blocks[: kept.count, steps, steps] += shift
         result[c, c] = blocks
     return result
-
-
-def _product(layout: Layout, S: Blocks, x: FloatArray) -> FloatArray:
-    parts = [np.ascontiguousarray(x[c.start : c.start + c.count * c.width]) for c in layout.kept]
-    return np.concatenate(multiply(layout, S, parts))

@@ -281,6 +281,10 @@ class ReducedSystem:
         H = self.equations.H[c, c][: kept.count * kept.width**2].reshape(kept.count, kept.width, kept.width)
         return np.einsum("nii->ni", H)
 
+    def flat_diagonal(self) -> FloatArray:
+        """Return the diagonal of H, (unknowns,)."""
+        return np.concatenate([self.diagonal(c).reshape(-1) for c in range(len(self.layout.kept))])
+
     def largest_landmark_slope(self) -> float:
         """Return the largest component of the landmarks' gradient over the root of its diagonal entry of V."""
         return float(np.sqrt(np.max(self._steepest)))

@@ -29,7 +29,7 @@ from groma.solver.covariance.datum import (
     moves_anything,
     unmoved,
 )
-from groma.solver.linear.blocks import multiply
+from groma.solver.linear.blocks import product
 from groma.solver.linear.schur import ReducedSystem
 from groma.solver.linear.visible_motion import camera_centers, motion
 from groma.solver.observability.gates import DIAGNOSIS
@@ -60,9 +60,9 @@ class Inspection:
         return np.concatenate([np.zeros((0, 3)), *self.centers.values()])
 
     @cached_property
-    def held(self) -> tuple[list[BoolArray], list[BoolArray]]:
-        """Which unknowns are held constant: by kept class, and by eliminated group in solver order."""
-        return held_coordinates(self.layout)
+    def held(self) -> BoolArray:
+        """Which unknowns of the reduced system are held constant."""
+        return held_coordinates(self.layout)[0]
 
     @cached_property
     def place_and_size(self) -> tuple[FloatArray, float]:
@@ -72,15 +72,14 @@ class Inspection:
     @cached_property
     def free_motions(self) -> tuple[FloatArray, FloatArray]:
         """World motions that cost nothing: combinations (7, k) of the seven, and their increments (unknowns, k)."""
-        G, held = self._world_motions(), np.concatenate(self.held[0])
-        diagonal = np.concatenate([self.system.diagonal(c).reshape(-1) for c in range(len(self.layout.kept))])
+        G, diagonal = self._world_motions(), self.system.flat_diagonal()
         combinations = np.eye(7)
-        if held.any():
-            combinations = unmoved(G[held], self.place_and_size[1])
+        if self.held.any():
+            combinations = unmoved(G[self.held], self.place_and_size[1])
         combinations = combinations[:, moves_anything(G.T @ (diagonal[:, None] * G), combinations)]
         if combinations.shape[1]:
             M = np.where(diagonal[:, None] > 0.0, G @ combinations, 0.0)  # what nothing sees is not in the way
-            cost = M.T @ np.stack([self._times(column) for column in M.T], axis=1)
+            cost = M.T @ np.stack([product(self.layout, self.system.S, column) for column in M.T], axis=1)
             size = M.T @ (diagonal[:, None] * M)
             scale = 1.0 / np.sqrt(np.maximum(np.diag(size), 1e-300))
             values, vectors = np.linalg.eigh(0.5 * (cost + cost.T) * scale[:, None] * scale)
@@ -88,13 +87,9 @@ class Inspection:
             unsure = (values > FREE_TOLERANCE * expected) & (values < DIAGNOSIS.certain * expected)
             if unsure.any() or self.system.num_singular_landmarks:
                 exact = free_motions(self.layout, self.equations, self.system)
-                return exact.combinations, np.concatenate(exact.kept)
+                return exact.combinations, exact.kept
             combinations = combinations @ (scale[:, None] * vectors)[:, values < FREE_TOLERANCE * expected]
         return combinations, G @ combinations
-
-    def _times(self, x: FloatArray) -> FloatArray:
-        parts = [np.ascontiguousarray(x[c.start : c.start + c.count * c.width]) for c in self.layout.kept]
-        return np.concatenate(multiply(self.layout, self.system.S, parts))
 
     def _world_motions(self) -> FloatArray:
         """Increments (unknowns, 7) of the kept variables under the seven world motions."""
@@ -102,13 +97,10 @@ class Inspection:
         mounted = {ref.group for slot, ref in references if slot.name == "extrinsics"}
         center, length = self.place_and_size
         G = np.zeros((self.layout.num_kept_unknowns, 7))
-        for c in self.layout.kept:
-            blocks = G[c.start : c.start + c.count * c.width].reshape(c.count, c.width, 7)
-            for member in c.members:
-                group = self.layout.problem.variables[member.group]
-                part = gauge_directions(group.manifold, group.state, center, length, member.group in mounted)
-                rows = member.blocks(np.arange(len(group)))
-                blocks[rows, member.offset : member.offset + member.dof] = part.transpose(1, 2, 0)
+        for name, at in self.layout.unknowns.items():
+            group = self.layout.problem.variables[name]
+            part = gauge_directions(group.manifold, group.state, center, length, name in mounted)
+            G[at] = part.transpose(1, 2, 0)
         return G
 
     def motion_of(self, name: str) -> FloatArray:
@@ -149,14 +141,14 @@ class Inspection:
                     inverse[rows] = -self.system.N[e].reshape(-1, dof, dof)
             for c, member in ((c, member) for c, kept in enumerate(self.layout.kept) for member in kept.members):
                 if member.group == part:
-                    own = slice(member.offset, member.offset + dof)
-                    information[mine] = self.system.S[c, c][member.blocks(np.arange(len(mine))), own, own]
+                    blocks = self.system.S[c, c][member.blocks(np.arange(len(mine)))]
+                    information[mine] = blocks[:, member.columns, member.columns]
         return information, np.zeros((len(group), dof), bool) if free is None else ~free, inverse
 
     @cached_property
     def landmarks(self) -> list[str]:
         """Groups of points and lines that may move."""
-        free = {e.group for e in self.layout.eliminated} | {m.group for c in self.layout.kept for m in c.members}
+        free = {e.group for e in self.layout.eliminated} | {*self.layout.unknowns}
         return [
             name
             for name, group in self.problem.variables.items()

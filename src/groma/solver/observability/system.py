@@ -29,9 +29,8 @@ def separate_parts(inspection: Inspection) -> list[Finding]:
     rows = np.concatenate([first[a] + r for (a, _), (r, _) in layout.blocks.items()])
     columns = np.concatenate([first[b] + c for (_, b), (_, c) in layout.blocks.items()])
     label = connected_parts(rows, columns, int(first[-1]))
-    for c, kept in enumerate(layout.kept):
-        group = kept.members[0].group
-        if layout.problem.variables[group].manifold.kind != "pose":
+    for c, (kept, kind) in enumerate(zip(layout.kept, layout.kinds, strict=True)):
+        if kind != "pose":
             continue
         seen = inspection.system.diagonal(c).sum(axis=1) > 0
         sizes = np.bincount(label[first[c] : first[c + 1]][seen])
@@ -42,7 +41,9 @@ def separate_parts(inspection: Inspection) -> list[Finding]:
                 f"The cameras fall into {len(sizes):,} groups that share no landmark (of {of} cameras): each can move, "
                 "turn and scale on its own. Add matches between them."
             )
-            findings.append(Finding("separate_parts", "problem", text, group, values={"parts": float(len(sizes))}))
+            findings.append(
+                Finding("separate_parts", "problem", text, kept.members[0].group, values={"parts": float(len(sizes))})
+            )
     return findings
 
 
@@ -50,25 +51,22 @@ def unseen_variables(inspection: Inspection) -> tuple[list[Finding], set[tuple[s
     """Find variables without any information from the data."""
     findings, found = [], set()
     unseen = _unseen(inspection)
-    for c in inspection.layout.kept:
-        blocks = unseen[c.start : c.start + c.count * c.width].reshape(c.count, c.width)
-        for member in c.members:
-            group = inspection.layout.problem.variables[member.group]
-            rows = member.blocks(np.arange(len(group)))
-            bad = np.flatnonzero(blocks[rows, member.offset : member.offset + member.dof].all(axis=1))
-            if len(bad) == 0:
-                continue
-            whole = [inspection.parts.whole(member.group, int(i)) for i in bad]
-            found |= {*whole}
-            what, one = first_upper(few([inspection.names(*variable) for variable in whole])), len(bad) == 1
-            if group.manifold.kind in ("plane", "direction"):
-                use = "lies on" if group.manifold.kind == "plane" else "runs along"
-                text = f"Nothing {use} {what[:1].lower()}{what[1:]}: {'it takes' if one else 'they take'} no part."
-                severity, code = "warning", f"{group.manifold.kind}_unused"
-            else:
-                text = f"{what} {'has' if one else 'have'} no observations at all."
-                severity, code = "problem", "no_observations"
-            findings.append(Finding(code, severity, text, whole[0][0], tuple(i for _, i in whole)))
+    for name, at in inspection.layout.unknowns.items():
+        kind = inspection.layout.problem.variables[name].manifold.kind
+        bad = np.flatnonzero(unseen[at].all(axis=1))
+        if len(bad) == 0:
+            continue
+        whole = [inspection.parts.whole(name, int(i)) for i in bad]
+        found |= {*whole}
+        what, one = first_upper(few([inspection.names(*variable) for variable in whole])), len(bad) == 1
+        if kind in ("plane", "direction"):
+            use = "lies on" if kind == "plane" else "runs along"
+            text = f"Nothing {use} {what[:1].lower()}{what[1:]}: {'it takes' if one else 'they take'} no part."
+            severity, code = "warning", f"{kind}_unused"
+        else:
+            text = f"{what} {'has' if one else 'have'} no observations at all."
+            severity, code = "problem", "no_observations"
+        findings.append(Finding(code, severity, text, whole[0][0], tuple(i for _, i in whole)))
     return findings, found
 
 
@@ -86,13 +84,10 @@ def unobservable_modes(
     """
     layout, problem = inspection.layout, inspection.problem
     unseen = _unseen(inspection)
-    held = np.concatenate(inspection.held[0])
     S = _with_open_coordinates(inspection, unseen)
     # where nothing but rounding is left of the diagonal, that of the system before elimination gives the scale
-    diagonal = np.concatenate([inspection.system.diagonal(c).reshape(-1) for c in range(len(layout.kept))])
-    size = np.maximum(scaled(layout, S)[1], np.sqrt(ROUNDING * diagonal))
-    G = inspection.free_motions[1].copy()
-    G[unseen | held] = 0.0
+    size = np.maximum(scaled(layout, S)[1], np.sqrt(ROUNDING * inspection.system.flat_diagonal()))
+    G = np.where((unseen | inspection.held)[:, None], 0.0, inspection.free_motions[1])
     modes = weak_modes(layout, divided(layout, S, size), size, G)
     if len(modes.values) == 0:
         return [], {}, 0
@@ -122,8 +117,7 @@ def unobservable_modes(
 
 def _unseen(inspection: Inspection) -> BoolArray:
     """Return which unknowns, not held, take no part in any residual."""
-    diagonal = [inspection.system.diagonal(c).reshape(-1) for c in range(len(inspection.layout.kept))]
-    return (np.concatenate(diagonal) == 0.0) & ~np.concatenate(inspection.held[0])
+    return (inspection.system.flat_diagonal() == 0.0) & ~inspection.held
 
 
 def _with_open_coordinates(inspection: Inspection, unseen: BoolArray) -> Blocks:
@@ -133,7 +127,7 @@ def _with_open_coordinates(inspection: Inspection, unseen: BoolArray) -> Blocks:
     """
     S = dict(inspection.system.S)
     for c, kept in enumerate(inspection.layout.kept):
-        part = unseen[kept.start : kept.start + kept.count * kept.width].reshape(kept.count, kept.width)
+        part = kept.blocks_of(unseen)
         part = part & ~part.all(axis=1, keepdims=True)
         if part.any():
             S[c, c] = S[c, c].copy()
@@ -147,16 +141,11 @@ def _excursions(inspection: Inspection, modes: Modes, size: FloatArray) -> dict[
     sigma = 1.0 / np.sqrt(np.maximum(modes.values, LEAST))
     steps = modes.vectors * (1.0 / size)[:, None]
     steps *= sigma
-    steps[np.concatenate(inspection.held[0])] = 0.0  # ones on the diagonal have no unit
+    steps[inspection.held] = 0.0  # ones on the diagonal have no unit
     result = {}
-    for c in inspection.layout.kept:
-        if inspection.layout.problem.variables[c.members[0].group].manifold.kind in ("point", "line"):
-            continue
-        blocks = steps[c.start : c.start + c.count * c.width].reshape(c.count, c.width, -1)
-        for member in c.members:
-            rows = member.blocks(np.arange(len(inspection.problem.variables[member.group])))
-            delta = blocks[rows, member.offset : member.offset + member.dof]
-            result[member.group] = inspection.motion_of(member.group) @ delta
+    for name, at in inspection.layout.unknowns.items():
+        if inspection.layout.problem.variables[name].manifold.kind not in ("point", "line"):
+            result[name] = inspection.motion_of(name) @ steps[at]
     if not result:
         return {}
     largest = np.max([np.abs(part).max(axis=(0, 1), initial=0.0) for part in result.values()], axis=0)

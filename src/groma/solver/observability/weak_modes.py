@@ -107,7 +107,7 @@ def _datum(layout: Layout, size: FloatArray, G: FloatArray) -> Blocks:
     The frame must be a natural one, because findings about cameras are relative to it.
     """
     datum = {(c, c): np.zeros((len(layout.blocks[c, c][0]), k.width, k.width)) for c, k in enumerate(layout.kept)}
-    kinds = [layout.problem.variables[c.members[0].group].manifold.kind for c in layout.kept]
+    kinds = layout.kinds
     G, left = G * size[:, None], np.eye(G.shape[1])  # in scaled unknowns, which have no unit
     for chosen in (("pose",), tuple(set(kinds) - {"pose"})):
         while left.shape[1]:
@@ -115,16 +115,13 @@ def _datum(layout: Layout, size: FloatArray, G: FloatArray) -> Blocks:
             strongest, where = 1e-9 * float(np.abs(G).max(initial=0.0)), None
             for c, kept in enumerate(layout.kept):
                 if kinds[c] in chosen:
-                    part = moved[kept.start : kept.start + kept.count * kept.width].reshape(kept.count, -1)
-                    strength = np.linalg.norm(part, axis=1)
+                    strength = np.linalg.norm(kept.blocks_of(moved).reshape(kept.count, -1), axis=1)
                     if strength.max(initial=0.0) > strongest:
                         strongest, where = float(strength.max()), (c, int(strength.argmax()))
             if where is None:
                 break
             c, block = where
-            first = layout.kept[c].start + block * layout.kept[c].width
-            rows = slice(first, first + layout.kept[c].width)
-            U, values, Vt = np.linalg.svd(moved[rows])
+            U, values, Vt = np.linalg.svd(layout.kept[c].blocks_of(moved)[block])
             rank = int((values > 1e-6 * values[0]).sum())
             datum[c, c][block] += U[:, :rank] @ U[:, :rank].T  # no motion along U
             left = left @ Vt[rank:].T
@@ -133,8 +130,7 @@ def _datum(layout: Layout, size: FloatArray, G: FloatArray) -> Blocks:
 
 def _lone_landmarks(layout: Layout) -> dict[int, BoolArray]:
     """For each kept class of points or lines, which of its blocks (count,) share none with another landmark."""
-    kinds = [layout.problem.variables[c.members[0].group].manifold.kind for c in layout.kept]
-    lone = {c: np.ones(layout.kept[c].count, bool) for c, kind in enumerate(kinds) if kind in ("point", "line")}
+    lone = {c: np.ones(layout.kept[c].count, bool) for c, kind in enumerate(layout.kinds) if kind in ("point", "line")}
     for (a, b), (rows, columns) in layout.blocks.items():
         if a in lone and b in lone:
             off = slice(None) if a != b else rows != columns

@@ -12,6 +12,7 @@ from groma.errors import ProblemError
 from groma.problem.layout import KeptClass, Layout, Member
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
+from groma.solver.linear.blocks import split
 from groma.solver.linear.choice import linear_solver
 from groma.solver.linear.contract import LinearSolver
 from groma.solver.linear.pcg import ConjugateGradients
@@ -89,17 +90,14 @@ class SharedSystem:
         if self._scattered is not None:
             self._scattered.begin_shard()
         for c, kept in enumerate(layout.kept):
-            diagonal = system.diagonal(c)
             # Blocks that this shard does not touch were given a one, so that they could be inverted.
             steps = np.arange(kept.width)
-            system.S[c, c][: kept.count, steps, steps] -= diagonal == 0.0
-            for member in kept.members:
-                g, block = self._groups.index(member.group), member.blocks(np.arange(self._sizes_of(member)[0]))
-                part = slice(member.offset, member.offset + member.dof)
-                gradient = system.equations.g_kept[c].reshape(-1, kept.width)
-                exact_sums.add(self._sums["curvature", g], diagonal[block, part])
-                exact_sums.add(self._sums["gradient", g], gradient[block, part])
-                exact_sums.add(self._sums["rhs", g], system.rhs[c].reshape(-1, kept.width)[block, part])
+            system.S[c, c][: kept.count, steps, steps] -= system.diagonal(c) == 0.0
+        curvature, gradient, rhs = system.flat_diagonal(), system.equations.g_kept, system.rhs
+        sums = {"curvature": curvature, "gradient": np.concatenate(gradient), "rhs": np.concatenate(rhs)}
+        for name, at in layout.unknowns.items():
+            for kind, values in sums.items():
+                exact_sums.add(self._sums[kind, self._groups.index(name)], values[at])
         for a, b, rows, columns, blocks in self._cut(layout, system):
             if a == b:
                 same = rows == columns
@@ -180,10 +178,7 @@ class SharedSystem:
                     if c == d and n < m:
                         continue
                     a, b = self._groups.index(first.group), self._groups.index(second.group)
-                    mine, other = (
-                        slice(first.offset, first.offset + first.dof),
-                        slice(second.offset, second.offset + second.dof),
-                    )
+                    mine, other = first.columns, second.columns
                     found = [(self._variable(first)[rows], self._variable(second)[columns], S[:, mine, other])]
                     if c == d and m != n:  # below the diagonal lies the transpose
                         off = rows != columns
@@ -192,12 +187,9 @@ class SharedSystem:
                     for row, column, blocks in found:
                         yield (a, b, row, column, blocks) if a <= b else (b, a, column, row, blocks.swapaxes(1, 2))
 
-    def _sizes_of(self, member: Member) -> tuple[int, int]:
-        return self._sizes[self._groups.index(member.group)]
-
     def _variable(self, member: Member) -> IntArray:
         """Return the variable of each block."""
-        count = self._sizes_of(member)[0]
+        count = len(self._variables[member.group])
         return np.arange(count) if member.block_of is None else np.argsort(member.block_of)
 
     def solver(self, layout: Layout, name: str) -> LinearSolver:
@@ -247,12 +239,7 @@ class SharedSystem:
 
     def part(self, layout: Layout, step: list[FloatArray]) -> list[FloatArray]:
         """Return a step in the blocks of a shard."""
-        parts = []
-        for kept in layout.kept:
-            blocks = np.zeros((kept.count, kept.width))
-            for member in kept.members:
-                count, dof = self._sizes_of(member)
-                delta = step[self._groups.index(member.group)].reshape(count, dof)
-                blocks[member.blocks(np.arange(count)), member.offset : member.offset + dof] = delta
-            parts.append(blocks.reshape(-1))
-        return parts
+        flat = np.zeros(layout.num_kept_unknowns)
+        for name, at in layout.unknowns.items():
+            flat[at] = step[self._groups.index(name)].reshape(at.shape)
+        return split(layout, flat)

@@ -65,7 +65,7 @@ def _matched(
     if good.sum() < gates.rectification.min_pairs:
         return first[:0], second[:0], np.zeros((0, 2))
     _, agree = cv2.findEssentialMat(
-        pixel[first[good]] - 0.5, there[good] - 0.5, camera.matrix_opencv, method=cv2.USAC_MAGSAC, prob=0.999,
+        pixel[first[good]] - 0.5, there[good] - 0.5, camera.matrix_opencv, method=cv2.USAC_MAGSAC,
         threshold=gates.start.max_error,
     )  # fmt: skip
     rows = np.flatnonzero(good)[np.asarray(agree).ravel() > 0]

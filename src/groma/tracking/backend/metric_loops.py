@@ -79,7 +79,7 @@ def adjusted_with(
     after = solve(Problem(before.problem.variables, [*alone.factors, motion_factors(again, "frames")]), settings)
     job.solved, job.report = after.problem, after.report
     rise = 2.0 * (after.report.final_cost - before.report.final_cost)
-    return job if rise < 6.0 * gates.jump**2 else None
+    return job if rise < 6.0 * gates.jump**2 else None  # derived from the six numbers of a motion
 
 
 def _steps(living: list[Keyframe], gates: LoopGates) -> Motions:

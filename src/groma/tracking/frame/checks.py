@@ -37,6 +37,7 @@ class FrameChecks:
             small = frame.gray[::8, ::8].astype(np.float32)
             level, contrast = float(small.mean()), float(small.std())
             if contrast < NORMAL.alike * IMAGES.noise:
+                # convention: words of a message
                 reason = "it is black" if level < 60 else "it is overexposed" if level > 200 else "it shows nothing"
             self._last_time = frame.timestamp
             if not reason:

@@ -90,6 +90,7 @@ def follow_frame(
         elif with_lines:
             segments = lines_followed()
             lines = measure_lines(track_map, data, segments, few_points=few)
+    # derived from the numbers that each tells of a pose
     if len(measured) + 2 * len(lines) + 3 * len(planes) < gates.verification.min_followed:
         return None, Followed.nothing()
     with watch("pose"):

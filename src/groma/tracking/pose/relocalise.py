@@ -126,7 +126,7 @@ def _log_alarms(camera: TrackCamera, pixel: FloatArray, agree: BoolArray, max_er
     """
     number = cells_of(camera, pixel)
     of, agreeing = len(np.unique(number)), len(np.unique(number[agree]))
-    if agreeing <= 3:
+    if agreeing <= 3:  # derived from three matches that fix a pose
         return math.inf
     chance = min(math.pi * max_error**2 / (camera.width * camera.height) * len(pixel) / of, 0.5)
     ways = math.comb(of, agreeing) * math.comb(agreeing, 3) * max(of - 3, 1)
@@ -302,7 +302,7 @@ class _Search:
                 track_map, camera, data, pose, factor * own.lines.distance, factor * SEGMENTS.angle
             )
             planes = self._planes_at(pose)
-            if len(pairs) + len(line_table) + len(planes) < 3:
+            if len(pairs) + len(line_table) + len(planes) < 3:  # derived from three matches that fix a pose
                 return None
             view = replace(track_map.view, points=temporary)
             around = (camera, view, Measurements(table, line_table, planes), self.predicted, self.prior_sigma, pose)

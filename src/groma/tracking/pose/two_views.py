@@ -79,7 +79,7 @@ def motions(camera: TrackCamera, one: FloatArray, two: FloatArray, gates: StartG
     """
     K, found = camera.matrix_opencv, []
     first, second = one - 0.5, two - 0.5
-    E, mask = cv2.findEssentialMat(first, second, K, method=cv2.USAC_MAGSAC, prob=0.999, threshold=gates.max_error)
+    E, mask = cv2.findEssentialMat(first, second, K, method=cv2.USAC_MAGSAC, threshold=gates.max_error)
     if E is not None and E.shape == (3, 3):
         _, R, t, _ = cv2.recoverPose(E, first, second, K, mask=mask)
         found.append((np.asarray(R), np.asarray(t)))

@@ -242,6 +242,7 @@ def _candidates(X: FloatArray, reach: FloatArray) -> tuple[IntArray, FloatArray]
     # Bins a few times as wide as the usual line; a line is in all that it may share with another.
     bounds = np.sort(X[:, :, across], axis=1) + reach[:, None] * np.array([-0.5, 0.5])
     start, extent = bounds[:, 0].min(), bounds[:, 1] - bounds[:, 0]
+    # (cost: time; pairs are put in the order of one sweep)
     width = max(4.0 * float(np.median(extent)), float(extent.sum()) / (4.0 * len(X)), np.ptp(bounds) / (4.0 * len(X)))
     bins = np.floor((bounds - start) / max(width, 1e-300)).astype(np.int64)
     first_bin, last_bin = np.ascontiguousarray(bins.T)
