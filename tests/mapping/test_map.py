@@ -2,6 +2,7 @@
 """From photographs to a map: what is refused, line matches from elsewhere, real photographs, the command."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -44,6 +45,9 @@ def test_bad_input_is_refused_in_one_sentence(tmp_path, model):
     with pytest.raises(InputError, match=r"None of the .* images of the model is in"):
         map_images(tmp_path / "empty", tmp_path / "work", model)
     with pytest.raises(InputError, match="holds 1 image; a map needs at least 3"):
+        map_images(tmp_path / "empty", tmp_path / "work")
+    shutil.copy(tmp_path / "empty" / "a.png", tmp_path / "empty" / "b.png")
+    with pytest.raises(InputError, match="holds 1 image and copies; a map needs at least 3"):
         map_images(tmp_path / "empty", tmp_path / "work")
     with pytest.raises(InputError, match="has 1 image with a pose"):
         map_images(tmp_path / "empty", tmp_path / "work", model.subset([0]))
