@@ -29,9 +29,11 @@ from groma.scene.synthetic.scenes import holistic
 
 def write_images(folder, scene, shape=(768, 1024), value=0):
     folder.mkdir()
-    for name in scene.images.names:
+    for number, name in enumerate(scene.images.names):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(folder / name), np.full(shape, value, np.uint8))
+        with (folder / name).open("ab") as file:
+            file.write(bytes([number]))  # no copies of each other
     return folder
 
 
