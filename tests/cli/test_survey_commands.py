@@ -166,8 +166,8 @@ def test_what_does_not_fit_the_photographs_is_refused_before_cameras_are_placed(
     monkeypatch.setattr(mapping, "start_of", never)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "images").mkdir()
-    for name in made()[0].images.names:
-        cv2.imwrite(str(tmp_path / "images" / name), np.zeros((768 // scale, 1024 // scale), np.uint8))
+    for number, name in enumerate(made()[0].images.names):
+        cv2.imwrite(str(tmp_path / "images" / name), np.full((768 // scale, 1024 // scale), number, np.uint8))
     assert run(["map", "images", "-o", "out", *options.format(folder=folder).split()]) == 1
     assert words in capsys.readouterr().err
 

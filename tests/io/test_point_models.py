@@ -6,7 +6,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from groma.errors import InputError
+from groma.errors import FileFormatError, InputError
 from groma.io import read_colmap, to_pycolmap, write_colmap
 from groma.io.colmap import mappers
 from groma.io.colmap import sfm as colmap_sfm
@@ -26,6 +26,21 @@ def test_of_several_models_the_one_with_most_images_is_read(tmp_path, form):
     with pytest.warns(UserWarning, match=r"images \(5, in sparse.1\) is read, the others \(3, 2 images\) are not"):
         assert read_colmap(tmp_path).num_images == 5
     assert read_colmap(tmp_path / "sparse" / "0").num_images == 2
+
+
+def test_a_model_that_lacks_a_file_is_named_beside_whole_ones(tmp_path):
+    scene = holistic(6, seed=0).start.points_only()
+    (tmp_path / "sparse").mkdir()
+    for number, count in ((0, 6), (1, 3)):
+        write_colmap(scene.subset(range(count)), tmp_path / "sparse" / str(number))
+    (tmp_path / "sparse" / "0" / "images.bin").unlink()
+    with pytest.warns(UserWarning, match=r"a further model that is not read, since sparse.0.images\.bin is missing"):
+        assert read_colmap(tmp_path).num_images == 3
+    (tmp_path / "sparse" / "1" / "images.bin").unlink()
+    with pytest.raises(FileFormatError, match=r"sparse.0.images\.bin, sparse.1.images\.bin are missing"):
+        read_colmap(tmp_path)
+    with pytest.raises(FileFormatError, match=r"holds no COLMAP model: .* images\.bin is missing"):
+        read_colmap(tmp_path / "sparse" / "1")
 
 
 @pytest.fixture

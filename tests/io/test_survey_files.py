@@ -247,32 +247,37 @@ def test_damaged_files(tmp_path, read, text, words):
         read(written(tmp_path, "file", text))
 
 
-def jpeg_with_position(order, latitude, longitude, altitude, below=0):
-    """A JPEG head whose EXIF holds a position, by the standard: two directories and their values."""
+def tiff_with_position(order, latitude, longitude, altitude, below=0, before=0):
+    """A TIFF structure that holds a position, by the standard: two directories, after other bytes, and their values."""
 
     def rationals(values):
-        return b"".join(struct.pack(order + "II", round(value * 10000), 10000) for value in values)
+        pairs = ((0, 0) if np.isnan(value) else (round(value * 10000), 10000) for value in values)
+        return b"".join(struct.pack(order + "II", *pair) for pair in pairs)
 
     def degrees(value):
         whole = int(abs(value))
         minutes = (abs(value) - whole) * 60
         return rationals([whole, int(minutes), (minutes - int(minutes)) * 60])
 
-    gps_at, count = 26, 6
+    gps_at, count = 26 + before, 6
     values_at = gps_at + 2 + 12 * count + 4
     entries = [
         (1, 2, 2, (b"N" if latitude >= 0 else b"S") + b"\0\0\0"), (2, 5, 3, struct.pack(order + "I", values_at)),
         (3, 2, 2, (b"E" if longitude >= 0 else b"W") + b"\0\0\0"), (4, 5, 3, struct.pack(order + "I", values_at + 24)),
         (5, 1, 1, bytes([below, 0, 0, 0])), (6, 5, 1, struct.pack(order + "I", values_at + 48)),
     ]  # fmt: skip
-    tiff = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(order + "I", 8)
+    tiff = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(order + "I", 8 + before) + bytes(before)
     tiff += (
         struct.pack(order + "H", 1) + struct.pack(order + "HHII", 0x8825, 4, 1, gps_at) + struct.pack(order + "I", 0)
     )
     tiff += struct.pack(order + "H", count)
     tiff += b"".join(struct.pack(order + "HHI", tag, kind, number) + value for tag, kind, number, value in entries)
-    tiff += struct.pack(order + "I", 0) + degrees(latitude) + degrees(longitude) + rationals([altitude])
-    body = b"Exif\0\0" + tiff
+    return tiff + struct.pack(order + "I", 0) + degrees(latitude) + degrees(longitude) + rationals([altitude])
+
+
+def jpeg_with_position(*position, **more):
+    """A JPEG head whose EXIF holds a position."""
+    body = b"Exif\0\0" + tiff_with_position(*position, **more)
     return b"\xff\xd8\xff\xe0\0\x04ab\xff\xe1" + struct.pack(">H", len(body) + 2) + body + b"\xff\xda"
 
 
@@ -285,6 +290,20 @@ def test_positions_in_exif(tmp_path, order):
     assert found.names == ("a.jpg", "b.jpg") and found.system.is_geographic
     np.testing.assert_allclose(found.coordinates, [[151.25, -34.5, -12.5], [-13.4007, 52.51926, 99]], atol=1e-7)
     assert "2 photographs without a position" in found.notes[0] and found.sigma[0].tolist() == [5, 5, 10]
+
+
+def test_positions_in_tiff_files_whose_directories_follow_the_pixels(tmp_path):
+    (tmp_path / "a.tif").write_bytes(tiff_with_position(">", 52.5, 13.4, 99, before=1 << 20))
+    found = read_exif_positions(tmp_path, ["a.tif"])
+    np.testing.assert_allclose(found.coordinates, [[13.4, 52.5, 99]], atol=1e-7)
+
+
+def test_a_height_of_zero_by_zero_is_unknown(tmp_path):
+    (tmp_path / "a.jpg").write_bytes(jpeg_with_position("<", 52.5, 13.4, np.nan))
+    (tmp_path / "b.jpg").write_bytes(jpeg_with_position("<", 52.5, 13.4, 99))
+    found = read_exif_positions(tmp_path, ["a.jpg", "b.jpg"])
+    assert found.coordinates[:, 2].tolist() == [99, 99] and found.sigma[:, 2].tolist() == [1e4, 10]
+    assert "1 photograph without a height" in found.notes[0]
 
 
 def test_damaged_exif_is_no_position(tmp_path):

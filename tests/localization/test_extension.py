@@ -67,10 +67,12 @@ def maps(place):
 def test_photographs_that_the_map_has_are_left_out(maps, place, tmp_path):
     """A folder to which photographs were added is passed as a whole; old ones would be in the map twice."""
     files = {name: place / half / name for half in HALVES for name in HALVES[half]}
+    (place / "copy.jpg").write_bytes(files[HALVES["b"][0]].read_bytes())
+    files |= {"copy.jpg": place / "copy.jpg"}
     choice = CalibrationChoice()
     made = extended_model(maps["a"], files, tmp_path / "work", tmp_path / "images", choice, quiet)
     assert sorted(made.scene.images.names) == FRAMES
-    assert made.warnings() == ["Left out, as the map has them already: 6 photographs."]
+    assert made.warnings() == ["Left out, as the map has them already, or as copies: 7 photographs."]
     files = {name: place / "a" / name for name in HALVES["a"]}
     with pytest.raises(InputError, match="The map has all of the 6 photographs already"):
         extended_model(maps["a"], files, tmp_path / "work", tmp_path / "images", choice, quiet)

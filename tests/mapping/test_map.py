@@ -2,6 +2,7 @@
 """From photographs to a map: what is refused, line matches from elsewhere, real photographs, the command."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,9 +29,11 @@ from groma.scene.synthetic.scenes import holistic
 
 def write_images(folder, scene, shape=(768, 1024), value=0):
     folder.mkdir()
-    for name in scene.images.names:
+    for number, name in enumerate(scene.images.names):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(folder / name), np.full(shape, value, np.uint8))
+        with (folder / name).open("ab") as file:
+            file.write(bytes([number]))  # no copies of each other
     return folder
 
 
@@ -44,6 +47,9 @@ def test_bad_input_is_refused_in_one_sentence(tmp_path, model):
     with pytest.raises(InputError, match=r"None of the .* images of the model is in"):
         map_images(tmp_path / "empty", tmp_path / "work", model)
     with pytest.raises(InputError, match="holds 1 image; a map needs at least 3"):
+        map_images(tmp_path / "empty", tmp_path / "work")
+    shutil.copy(tmp_path / "empty" / "a.png", tmp_path / "empty" / "b.png")
+    with pytest.raises(InputError, match="holds 1 image and copies; a map needs at least 3"):
         map_images(tmp_path / "empty", tmp_path / "work")
     with pytest.raises(InputError, match="has 1 image with a pose"):
         map_images(tmp_path / "empty", tmp_path / "work", model.subset([0]))

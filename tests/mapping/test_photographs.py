@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from groma.errors import InputError
-from groma.mapping.photographs import check_names, image_files, read_gray
+from groma.mapping.photographs import check_names, copies_among, copies_left_out, image_files, read_gray
 
 
 def test_every_kind_of_image_is_read_as_it_is_stored(tmp_path):
@@ -48,6 +48,17 @@ def test_folders_are_looked_into_unless_they_are_hidden(tmp_path):
         "b/1.jpg",
         "b/c/2.JPG",
     ]
+
+
+def test_copies_are_no_further_photographs(tmp_path):
+    files = {"a (1).jpg": b"one", "a.jpg": b"one", "b/a.jpg": b"one", "b.jpg": b"two", "c.jpg": b"three"}
+    for name, content in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(content)
+    copies = copies_among(tmp_path, [*files, "missing.jpg"])
+    assert copies == {"a (1).jpg": "a.jpg", "b/a.jpg": "a.jpg"}
+    said = "2 of 5 images are copies of others and were not used: a (1).jpg of a.jpg, b/a.jpg of a.jpg."
+    assert copies_left_out(copies, 5) == [said] and copies_left_out({}, 5) == []
 
 
 def test_the_whole_disk_is_no_folder_of_images(monkeypatch):

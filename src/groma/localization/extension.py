@@ -16,11 +16,11 @@ from groma.errors import InputError
 from groma.evaluation.alignment import align_poses
 from groma.localization.calibration import CalibrationChoice
 from groma.localization.localizer import Localizer
-from groma.localization.map_images import content_digest
 from groma.localization.map_index import Progress
 from groma.localization.placed import PlacedImage
 from groma.localization.posed_model import gather_photographs, with_photographs
 from groma.localization.run import localize_images
+from groma.mapping.photographs import content_digest
 from groma.mapping.result import MapResult
 from groma.scene import Scene, Similarity
 from groma.scene.table import joined
@@ -43,7 +43,7 @@ class ExtendedModel:
 
     def warnings(self) -> list[str]:
         """Say which photographs are left out."""
-        known = [f"Left out, as the map has them already: {counted(self.num_known, 'photographs')}."]
+        known = [f"Left out, as the map has them already, or as copies: {counted(self.num_known, 'photographs')}."]
         known = known if self.num_known else []
         left = [one for one in self.queries if one.status != "localized"]
         if not left:
@@ -117,12 +117,13 @@ def _with_new_lenses(scene: Scene, before: Scene) -> Scene:
 
 
 def _without_known(files: Mapping[str, Path], known: Sequence[Path]) -> dict[str, Path]:
-    """Return the photographs whose content is that of none of some others; those that cannot be read are kept."""
+    """Return the photographs that are no copies of known ones or of each other; what cannot be read is kept."""
     digests, fresh = {content_digest(path) for path in known}, dict(files)
     for name, path in files.items():
         with suppress(OSError):
-            if content_digest(path) in digests:
+            if (digest := content_digest(path)) in digests:
                 del fresh[name]
+            digests.add(digest)
     return fresh
 
 

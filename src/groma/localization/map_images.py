@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import defaultdict
 from pathlib import Path
 
@@ -42,11 +41,6 @@ def image_paths(scene: Scene, folder: Path) -> list[Path]:
             )
         found[row] = alike[0]
     return found
-
-
-def content_digest(path: Path) -> str:
-    """Return what tells the content of a photograph from that of any other."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def images_in_summary(map_: Path) -> Path | None:

@@ -7,10 +7,12 @@ camera of a model has the size of the stored image.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import posixpath
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -55,6 +57,30 @@ def image_files(folder: Path) -> list[Path]:
             f"The name of the image {shown(wrong)} cannot stand in a model: it must be UTF-8, in one line. Rename it."
         )
     return files
+
+
+def content_digest(path: Path) -> str:
+    """Return what tells the content of a photograph from that of any other."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def copies_among(folder: Path, names: Sequence[str]) -> dict[str, str]:
+    """Return the images whose file is a copy of another's, by name, and that other, whose name is the shortest.
+
+    A copy is no second measurement: its noise is that of the other, and it shows everything from the same place.
+    """
+    alike: defaultdict[int, list[str]] = defaultdict(list)
+    for name in sorted(names, key=lambda name: (len(name), name)):
+        with suppress(OSError):
+            alike[(folder / name).stat().st_size].append(name)
+    first: dict[str, str] = {}
+    found = {}
+    for name in (name for group in alike.values() if len(group) > 1 for name in group):
+        with suppress(OSError):
+            other = first.setdefault(content_digest(folder / name), name)
+            if other != name:
+                found[name] = other
+    return found
 
 
 def image_reader(folder: Path, names: Sequence[str]) -> Callable[[int], GrayImage]:
@@ -120,11 +146,13 @@ def check_names(folder: Path, names: Sequence[str], scene: Scene) -> None:
     )
 
 
-def check_number(folder: Path, names: Sequence[str], model: Scene | None, min_images: int) -> None:
-    """Check that there are images and points enough for a map, and that the folder has the images of the model."""
+def check_number(
+    folder: Path, names: Sequence[str], copies: Collection[str], model: Scene | None, min_images: int
+) -> None:
+    """Check that there are images enough for a map, copies not counted, and all those of the model."""
     if model is None:
         if len(names) < 3:
-            held = counted(len(names), "images")
+            held = counted(len(names), "images") + (" and copies" if copies else "")
             raise InputError(f"{folder} holds {held}; a map needs at least 3 that overlap. Take more.")
         return
     if model.num_images < max(2, min_images):
@@ -158,6 +186,15 @@ def images_left_out(names: Sequence[str], used: Sequence[str], model_given: bool
         f"{len(left)} of {len(names)} images {why} and {'was' if one else 'were'} not used: {first_of(left, 3)}."
         + ("" if model_given else remedy)
     ]
+
+
+def copies_left_out(copies: Mapping[str, str], count: int) -> list[str]:
+    """Say which of some images are copies of others (:func:`copies_among`), in at most one sentence."""
+    if not copies:
+        return []
+    pairs = first_of([f"{name} of {other}" for name, other in sorted(copies.items())], 3)
+    which = "is a copy of another and was" if len(copies) == 1 else "are copies of others and were"
+    return [f"{len(copies)} of {count} images {which} not used: {pairs}."]
 
 
 def _suggestion(folder: Path, names: Sequence[str], missing: list[str]) -> str:

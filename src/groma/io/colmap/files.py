@@ -54,9 +54,30 @@ def find_model(path: str | os.PathLike[str]) -> tuple[Path, Literal["binary", "t
 
 def models_in_parts(root: Path) -> dict[Path, int]:
     """Return the models ``sparse/0``, ``sparse/1``, ... of a folder with their numbers of images, the largest first."""
-    parts = sorted((p for p in (root / "sparse").glob("[0-9]*") if p.name.isdecimal()), key=lambda p: int(p.name))
-    found = {place: _num_images(place) for place in parts if _form(place) is not None}
+    found = {place: _num_images(place) for place in _parts(root) if _form(place) is not None}
     return dict(sorted(found.items(), key=lambda one: -one[1]))
+
+
+def missing_from_parts(root: Path) -> str:
+    """Say which files models ``sparse/0``, ``sparse/1``, ... of a folder lack; empty where they are whole."""
+    return _are_missing([f"{place.relative_to(root)}/{name}" for place in _parts(root) for name in _missing(place)])
+
+
+def _parts(root: Path) -> list[Path]:
+    return sorted((p for p in (root / "sparse").glob("[0-9]*") if p.name.isdecimal()), key=lambda p: int(p.name))
+
+
+def _missing(place: Path) -> list[str]:
+    """Return the files that a model in a folder lacks; none where there is a whole one, or nothing of one."""
+    lacking = [
+        [f"{name}{end}" for name in _FILES if not (place / f"{name}{end}").is_file()] for end in (".bin", ".txt")
+    ]
+    fewest = min(lacking, key=len)
+    return fewest if len(fewest) < len(_FILES) else []
+
+
+def _are_missing(files: list[str]) -> str:
+    return f"{', '.join(files)} {'is' if len(files) == 1 else 'are'} missing" if files else ""
 
 
 def is_model(place: Path) -> bool:
@@ -89,6 +110,8 @@ def _remedy(root: Path) -> str:
     models = [
         name for name in names if (root / name / "cameras.bin").is_file() or (root / name / "cameras.txt").is_file()
     ]
+    if missing := _are_missing(_missing(root)) or missing_from_parts(root):
+        return f"{missing}: fetch or export it again."
     if archives or models:
         return f"It holds {' and '.join((archives + models)[:3])}: pass {root / (archives + models)[0]}, for example."
     if any(name.lower().endswith(IMAGES) for name in names):

@@ -12,6 +12,7 @@ to images and points by identifier, so they survive changes made to the model by
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping
 from operator import itemgetter
 from pathlib import Path
@@ -32,6 +33,7 @@ from groma.io.colmap.files import (
     damage_in_text,
     find_model,
     is_model,
+    missing_from_parts,
     models_in_parts,
     points_in_images,
 )
@@ -75,6 +77,8 @@ def read_colmap(path: str | os.PathLike[str]) -> Scene:
     folder, form = find_model(path)
     if folder in (parts := models_in_parts(Path(path))):
         warn_of_the_others(path, list(parts.values()), f", in {folder.relative_to(path)}")
+        if missing := missing_from_parts(Path(path)):
+            warnings.warn(f"{path} holds a further model that is not read, since {missing}.", stacklevel=2)
     pycolmap = load_pycolmap()
     with reading(folder, _KIND), quiet(pycolmap):
         reconstruction, seen, points = pycolmap.Reconstruction(), None, None

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Positions that cameras wrote into their photographs: the GPS part of EXIF, of JPEG and TIFF files.
 
-Only the first bytes of a file are read, and only the requested tags; damaged ones count as missing.
+Only what is asked for is read, at the head of a JPEG file and anywhere in a TIFF file, whose directories usually follow
+the pixels; damaged entries count as missing.
 
 Reference: CIPA DC-008, *Exchangeable image file format*, sections 4.5 and 4.6.6.
 """
 
 from __future__ import annotations
 
+import mmap
 import os
 import struct
 from collections.abc import Sequence
@@ -19,10 +21,12 @@ from groma._counted import counted
 from groma.errors import InputError
 from groma.io.survey.coordinates import CoordinateSystem, Places
 
-#: Bytes of a file that are read: EXIF stands in one of the first segments, of 64 kB at most (cost: time only).
+#: Bytes of a JPEG file that are read: EXIF stands in one of the first segments, of 64 kB at most (cost: time only).
 _HEAD = 1 << 18
 #: Tags of the format.
 _GPS, _RATIONAL = 0x8825, 5
+#: First bytes of a TIFF file.
+_TIFF = (b"II*\0", b"MM\0*")
 #: Standard deviations of receivers in cameras and phones, metres: east, north, height (convention: of receivers without
 #: corrections).
 EXIF_SIGMA = (5.0, 5.0, 10.0)
@@ -66,16 +70,18 @@ def position_of(path: Path) -> tuple[float, float, float] | None:
     """Return longitude, latitude (degrees) and height of a photograph; None without, NaN for a missing height."""
     try:
         with path.open("rb") as file:
-            block = _tiff_of(file.read(_HEAD))
+            head = file.read(_HEAD)
+            if head[:4] in _TIFF:
+                with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as whole:
+                    return _position(whole)
+        block = _exif_of(head)
         return None if block is None else _position(block)
     except (OSError, struct.error, ValueError, ZeroDivisionError):
         return None
 
 
-def _tiff_of(head: bytes) -> bytes | None:
-    """Return the TIFF structure with the EXIF of a file."""
-    if head[:4] in (b"II*\0", b"MM\0*"):
-        return head
+def _exif_of(head: bytes) -> bytes | None:
+    """Return the TIFF structure in which a JPEG file holds its EXIF."""
     if head[:2] != b"\xff\xd8":
         return None
     at = 2
@@ -87,7 +93,7 @@ def _tiff_of(head: bytes) -> bytes | None:
     return None
 
 
-def _position(block: bytes) -> tuple[float, float, float] | None:
+def _position(block: bytes | mmap.mmap) -> tuple[float, float, float] | None:
     order = "<" if block[:2] == b"II" else ">"
     main = _entries(block, order, struct.unpack_from(order + "I", block, 4)[0])
     if _GPS not in main:
@@ -97,7 +103,8 @@ def _position(block: bytes) -> tuple[float, float, float] | None:
         return None
     degrees = []
     for tag, negative in ((4, b"W"), (2, b"S")):
-        whole, minutes, seconds = _rationals(block, order, gps[tag], 3)
+        whole, *parts = _rationals(block, order, gps[tag], 3)
+        minutes, seconds = np.nan_to_num(parts)  # 0/0: unknown, the part before it has decimals
         value = whole + minutes / 60.0 + seconds / 3600.0
         reference = block[gps[tag - 1][2] : gps[tag - 1][2] + 1] if tag - 1 in gps else b""
         degrees.append(-value if reference.upper() == negative else value)
@@ -110,7 +117,7 @@ def _position(block: bytes) -> tuple[float, float, float] | None:
     return degrees[0], degrees[1], height
 
 
-def _entries(block: bytes, order: str, offset: int) -> dict[int, tuple[int, int, int]]:
+def _entries(block: bytes | mmap.mmap, order: str, offset: int) -> dict[int, tuple[int, int, int]]:
     """Return type, count and place of the value of the entries of a directory, by tag."""
     count = min(struct.unpack_from(order + "H", block, offset)[0], 512)
     found = {}
@@ -120,10 +127,10 @@ def _entries(block: bytes, order: str, offset: int) -> dict[int, tuple[int, int,
     return found
 
 
-def _rationals(block: bytes, order: str, entry: tuple[int, int, int], count: int) -> list[float]:
+def _rationals(block: bytes | mmap.mmap, order: str, entry: tuple[int, int, int], count: int) -> list[float]:
     kind, number, place = entry
     if kind != _RATIONAL or number < count:
         raise ValueError(f"expected {count} rationals")
     start = struct.unpack_from(order + "I", block, place)[0]
     parts = struct.unpack_from(f"{order}{2 * count}I", block, start)
-    return [above / below if below or above else 0.0 for above, below in zip(parts[::2], parts[1::2], strict=True)]
+    return [above / below if below else float("nan") for above, below in zip(parts[::2], parts[1::2], strict=True)]

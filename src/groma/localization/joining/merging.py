@@ -25,7 +25,6 @@ from groma.geometry.segment2 import segments_apart
 from groma.geometry.so3 import hat
 from groma.localization.joining.measurements import with_measurements_of
 from groma.localization.localizer import LocalizedImage, Localizer
-from groma.localization.map_images import content_digest
 from groma.localization.map_index import Progress
 from groma.localization.placed import PlacedImage
 from groma.localization.pose.camera import QueryCamera
@@ -34,6 +33,7 @@ from groma.localization.pose.verdict import moved as way_between
 from groma.localization.posed_model import gather_photographs, with_photographs
 from groma.mapping.carried.kept_lines import with_lines_of
 from groma.mapping.noise.landmarks import project_points
+from groma.mapping.photographs import content_digest
 from groma.scene import Scene, Similarity
 
 

@@ -66,13 +66,13 @@ REMEDIES = {
     Outcome.NO_MATCH: "a model with the right poses, calibration and image size; sharp photographs",
     Outcome.DEGENERATE: "photographs from another height or side: the camera moved along these lines, or hardly",
     Outcome.NO_SUPPORT: "more photographs of the same parts; or, where points do not fit, better poses and calibration "
-    "(--refine-intrinsics): an error of a few pixels leaves no agreement",
+    "(--refine-intrinsics estimates a given one): an error of a few pixels leaves no agreement",
     Outcome.AMBIGUOUS: "more photographs, or matches from elsewhere (--line-matches): the structure repeats itself",
     Outcome.NOT_LINKED: "more photographs of the same parts",
-    Outcome.OUTLIER: "better poses and calibration (--refine-intrinsics)",
+    Outcome.OUTLIER: "better poses and calibration (--refine-intrinsics estimates a given one)",
     Outcome.FEW_IMAGES: "more photographs of the same parts",
     Outcome.UNCERTAIN: "photographs from further apart",
-    Outcome.SHORT_LINE: "a smaller MapLinesOptions.min_longest, or larger images",
+    Outcome.SHORT_LINE: "larger images; from Python, a smaller MapLinesOptions.min_longest",
     Outcome.REPEATED: "photographs from nearer, which show edges close to each other as two",
-    Outcome.TEXTURE: "MapLinesOptions.min_repeatability = 0, if lines of texture are wanted",
+    Outcome.TEXTURE: "nothing, unless lines of texture are wanted: from Python, MapLinesOptions.min_repeatability = 0",
 }
