@@ -111,6 +111,8 @@ def _document(scene: Scene) -> _Document:
     document.add("nodes", top)
 
     def node(**entry: Any) -> None:
+        if "mesh" in entry:  # readers name geometry by node or by mesh
+            document.content["meshes"][entry["mesh"]]["name"] = entry["name"]
         top["children"].append(document.add("nodes", entry))
 
     plain = document.add("materials", {"name": "colours", "extensions": {"KHR_materials_unlit": {}}})
