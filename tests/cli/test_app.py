@@ -18,10 +18,14 @@ from groma.errors import InputError, OutputError
 COMMANDS = [[command.name] for command in app.registered_commands] + [["evaluate", "poses"]]
 
 
+@pytest.mark.parametrize("columns", ["60", "80", "120"])
 @pytest.mark.parametrize("command", [[], ["evaluate"], *COMMANDS], ids=" ".join)
-def test_help(command, capsys):
+def test_help(command, columns, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", columns)
     assert run([*command, "--help"]) == 0
-    assert "Usage: groma" in capsys.readouterr().out
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("Usage: groma") and max(map(len, lines)) <= int(columns)
+    assert not any(line.endswith("-") for line in lines)  # no name of an option is broken
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)

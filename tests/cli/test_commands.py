@@ -224,12 +224,21 @@ def test_convert(scenes, here, name, capsys):
     assert numbers["num_points"] == read_scene(here / name).num_points
 
 
-def test_geometry_holds_no_photographs(scenes, here, capsys):
+@pytest.mark.parametrize(
+    ("name", "cameras"),
+    [
+        ("out.ply", ""),
+        ("out.obj", ""),
+        ("out.dxf", "6 images, "),
+        ("out.glb", "6 images, "),
+        ("out.gltf", "6 images, "),
+    ],
+)
+def test_geometry_holds_no_observations(scenes, here, capsys, name, cameras):
     scene = read_scene(scenes / "start.npz")
-    for name in ("out.ply", "out.obj"):
-        assert run(["convert", str(scenes / "start.npz"), name]) == 0
-        said = capsys.readouterr().out
-        assert said == f"Wrote {name}: {scene.num_points} points, {scene.num_lines} lines, 1 plane\n"
+    assert run(["convert", str(scenes / "start.npz"), name]) == 0
+    said = capsys.readouterr().out
+    assert said == f"Wrote {name}: {cameras}{scene.num_points} points, {scene.num_lines} lines, 1 plane\n"
 
 
 def test_evaluate_poses(scenes, here, capsys):

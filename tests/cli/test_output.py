@@ -10,7 +10,15 @@ import pytest
 
 from groma.bounded.json_text import plain
 from groma.cli.main import run
-from groma.cli.shared.output import atomic_output, check_json, check_output, check_outputs, work_folder, write_json
+from groma.cli.shared.output import (
+    atomic_output,
+    check_json,
+    check_output,
+    check_outputs,
+    subject,
+    work_folder,
+    write_json,
+)
 from groma.errors import OutputError
 
 
@@ -189,3 +197,23 @@ def test_json_target_is_checked_early(tmp_path):
     (tmp_path / "r.json").write_text("{}")
     with pytest.raises(OutputError, match="--force"):
         check_json(str(tmp_path / "r.json"), force=False)
+
+
+@pytest.mark.parametrize(
+    ("path", "name"),
+    [
+        ("castle/images", "castle"),
+        ("castle/sparse/0", "castle"),
+        ("castle/dense/sparse", "castle"),
+        ("castle", "castle"),
+        ("castle/photos/day_2", "day_2"),
+        ("kitti/sequences/00", "00"),
+        ("problem-49.txt.bz2", "problem-49.txt.bz2"),
+        ("/images", "images"),
+        ("x/..", "here"),
+    ],
+)
+def test_a_heading_names_the_project_and_not_a_folder_that_every_project_has(path, name, tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    assert subject(Path(path)) == name

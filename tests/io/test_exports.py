@@ -53,7 +53,7 @@ def test_gltf_read_by_trimesh(scene, tmp_path, name):
     found = trimesh.load_scene(tmp_path / name)
     read = {node: found.geometry[found.graph[node][1]] for node in found.graph.nodes_geometry}
     names = {"points", "lines", "frusta", *(f"plane {number}" for number in scene.planes.ids)}
-    assert set(read) == names
+    assert set(read) == set(found.geometry) == names  # by node, and by mesh
     text = (tmp_path / name).read_text() if name.endswith("gltf") else json.dumps(_document(tmp_path / name)[0])
     shift = np.array(json.loads(text)["nodes"][0]["extras"]["shift"])
     assert np.linalg.norm(shift) > 1e6

@@ -7,7 +7,8 @@ from _scene import exact_scene
 
 from groma.geometry import se3
 from groma.scene import Lines, Points, Scene
-from groma.scene.local_frame import upward
+from groma.scene.local_frame import up_of, upward
+from groma.scene.survey import CameraPositions
 from groma.scene.synthetic.scenes import holistic
 from groma.viz.drawable import drawable
 from groma.viz.framing import FOR_CAMERAS, OPENING, StartingView, horizontal, starting_view
@@ -87,9 +88,26 @@ def test_scenes_with_little_in_them():
 
 
 def test_up():
-    np.testing.assert_allclose(upward(np.array([[0.0, 1.0, 0.1], [0.0, 1.0, -0.1]])), [0, -1, 0])
-    np.testing.assert_allclose(upward(np.array([[0.0, 1.0, 0], [0.0, -1.0, 0]])), [0, 0, 1])
-    np.testing.assert_allclose(upward(np.zeros((0, 3))), [0, 0, 1])
+    turned = np.diag([1.0, -1.0, -1.0])
+    np.testing.assert_allclose(upward(np.eye(3)[None]), [0, -1, 0])
+    np.testing.assert_allclose(upward(np.array([np.eye(3), turned])), [0, 0, 1])  # upside down, and to the other side
+    np.testing.assert_allclose(upward(np.zeros((0, 3, 3))), [0, 0, 1])
+    # From above, on the way there and back: up is where they were taken.
+    there, back = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]), np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    np.testing.assert_allclose(upward(np.array([there, back])), [-1, 0, 0])
+
+
+def test_where_heights_are_measured_z_is_up():
+    """Photographs from above whose tops are all to the north."""
+    made, rng = exact_scene(), np.random.default_rng(1)
+    poses = np.array([[1.0, 0, 0, 0, 0, 0, 10], [1.0, 0, 0, 0, -1, 0, 10]])  # x to the east, y to the south, z down
+    points = Points.at(np.column_stack([rng.uniform(-3, 4, (40, 2)), 0.1 * rng.normal(size=40)]))
+    scene = Scene.from_images(made.cameras, ("a.jpg", "b.jpg"), [0, 1], poses, points=points)
+    np.testing.assert_allclose(up_of(scene), [0, 1, 0], atol=1e-12)  # nothing says otherwise
+    measured = CameraPositions(np.arange(2), scene.cam_centers_in_world, np.tile(0.01 * np.eye(3), (2, 1, 1)))
+    surveyed = scene.replace(camera_positions=measured)
+    np.testing.assert_array_equal(up_of(surveyed), [0, 0, 1])
+    assert _view(surveyed).elevation > 0.6  # the ground is seen as from a hill, not as a wall
 
 
 @pytest.mark.parametrize("far", [1e40, 1e308])

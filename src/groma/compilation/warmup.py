@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from groma._kernels import cache as kernel_cache
-from groma.errors import InputError, OutputError
+from groma.errors import InputError, OutputError, did_you_mean
 
 PARTS = ("adjust", "map", "track")
 
@@ -67,8 +67,10 @@ def warm_up(
         If compiled functions can be kept nowhere.
     """
     began, before = time.perf_counter(), asdict(kernel_cache.counts)
-    if unknown := {*parts} - {*PARTS}:
-        raise InputError(f"There is nothing to compile for {', '.join(sorted(unknown))}; there are {', '.join(PARTS)}.")
+    if unknown := sorted({*parts} - {*PARTS}):
+        raise InputError(
+            f"There is no part named {unknown[0]!r}; choose of {', '.join(PARTS)}.{did_you_mean(unknown[0], PARTS)}"
+        )
     if not place():
         raise OutputError(
             "No folder for compiled functions can be written, so nothing would be kept. Set NUMBA_CACHE_DIR to one."

@@ -21,6 +21,7 @@ from groma.errors import InputError
 from groma.geometry import se3
 from groma.scene import Scene
 from groma.scene.line_intervals import line_pieces
+from groma.scene.local_frame import up_of
 from groma.scene.patches import PALETTE, patch_groups, plane_patches
 
 Part = Literal["points", "lines", "planes"]
@@ -71,6 +72,8 @@ class DrawnCameras:
     #: (N,) vertical opening, radians, and width over height.
     opening: FloatArray
     aspect: FloatArray
+    #: (3,) the direction that is up.
+    up: FloatArray
     #: Depth at which picture planes are drawn, scene units: such that neighbours do not hide each other.
     depth: float
 
@@ -121,7 +124,9 @@ def drawn_cameras(scene: Scene) -> DrawnCameras:
     """Return the cameras of a scene."""
     world_from_cam = se3.to_matrix(se3.inverse(scene.cam_from_world))
     opening, aspect = openings(scene)
-    return DrawnCameras(scene.images.names, world_from_cam, opening, aspect, _depth(world_from_cam[:, :3, 3]))
+    return DrawnCameras(
+        scene.images.names, world_from_cam, opening, aspect, up_of(scene), _depth(world_from_cam[:, :3, 3])
+    )
 
 
 def middle_of(geometry: Drawn, shown: DrawnCameras) -> FloatArray:

@@ -20,12 +20,10 @@ def counts_of(scene: "Scene") -> dict[str, int]:
     }
 
 
-def sentence_of(scene: "Scene", geometry: bool = False) -> str:
-    """Return for example ``16 images, 22,106 points, 83,718 observations``; of ``geometry`` without the photographs."""
+def sentence_of(scene: "Scene", *kinds: str) -> str:
+    """Return for example ``16 images, 22,106 points, 83,718 observations``; of some ``kinds`` only, if named."""
     counts = {name.removeprefix("num_"): count for name, count in counts_of(scene).items()}
-    if geometry:
-        counts = {kind: counts[kind] for kind in ("points", "lines", "planes")}
-    said = [counted(count, kind) for kind, count in counts.items() if count or kind == "images"]
+    said = [counted(counts[kind], kind) for kind in kinds or counts if counts[kind] or kind == "images"]
     return ", ".join(said) or "nothing"
 
 

@@ -14,6 +14,7 @@ import math
 import numpy as np
 
 from groma._typing import FloatArray
+from groma.geometry import quaternion
 from groma.scene.scene import Scene
 from groma.scene.similarity import Similarity
 
@@ -65,9 +66,26 @@ def _middle_and_extent(scene: Scene) -> tuple[FloatArray, float]:
     return middle, float(np.median(np.linalg.norm(places - middle, axis=1)))
 
 
-def upward(down: FloatArray) -> FloatArray:
-    """Return the direction (3,) opposite to the mean y axis (N, 3) of cameras; z where these do not agree."""
-    up = -down.sum(axis=0)
-    if np.linalg.norm(up) < 0.3 * max(len(down), 1):
+def up_of(scene: Scene) -> FloatArray:
+    """Return the direction (3,) that is up: z, where heights or gravity were measured, else :func:`upward`.
+
+    Photographs taken from above have their tops to the north, not up.
+    """
+    has_heights = len(scene.camera_positions) + int(scene.control_points.is_control.sum()) > 1
+    if has_heights or len(scene.known_directions):
         return np.array([0.0, 0.0, 1.0])
-    return up / np.linalg.norm(up)
+    return upward(quaternion.to_matrix(scene.cam_from_world[:, :4]))
+
+
+def upward(axes: FloatArray) -> FloatArray:
+    """Return the direction (3,) to the tops of photographs; against the view where these differ, as from above; else z.
+
+    Parameters
+    ----------
+    axes : (N, 3, 3) float64
+        Rows are the x, y and z axes of a camera, in the world.
+    """
+    for up in (-axes[:, 1].sum(axis=0), -axes[:, 2].sum(axis=0)):
+        if (length := np.linalg.norm(up)) > 0.3 * len(axes):
+            return up / length
+    return np.array([0.0, 0.0, 1.0])

@@ -22,24 +22,24 @@ ROUNDING = 1e-14
 class Termination(Enum):
     """Why a solve stopped; ``sentence`` explains it, with causes and remedies."""
 
-    COST_CONVERGED = ("cost_converged", True, "Converged: a step changes the cost by less than function_tolerance.")
-    GRADIENT_CONVERGED = (
-        "gradient_converged",
-        True,
-        "Converged: the gradient has vanished (its largest component is below gradient_tolerance).",
-    )
-    STEP_CONVERGED = ("step_converged", True, "Converged: steps have become negligible (below step_tolerance).")
+    #: A step changes the cost by less than ``function_tolerance`` of it.
+    COST_CONVERGED = ("cost_converged", True, "Converged: further steps hardly change the cost.")
+    #: The largest component of the gradient is below ``gradient_tolerance``.
+    GRADIENT_CONVERGED = ("gradient_converged", True, "Converged: the gradient has vanished.")
+    #: Steps are below ``step_tolerance``.
+    STEP_CONVERGED = ("step_converged", True, "Converged: steps have become negligible.")
     MAX_ITERATIONS = (
         "max_iterations",
         False,
-        "Stopped at max_iterations before convergence. The result is the best state found; raise max_iterations, or "
-        "check for outliers (use a robust loss) and weakly determined landmarks.",
+        "Stopped at the iteration limit before convergence. The result is the best state found; allow more steps "
+        "(--max-iterations, max_iterations=), or check for outliers (a robust loss helps) and weak landmarks.",
     )
     DAMPING_EXHAUSTED = (
         "damping_exhausted",
         False,
         "Stopped: no step reduced the cost, even with the strongest damping. Causes: (a) the state is at a minimum to "
-        "machine precision, (b) a Jacobian of an own factor is wrong (run check_factor), (c) outliers of extreme size.",
+        "machine precision, (b) a Jacobian of a factor of your own is wrong (groma.testing.check_factor tells), "
+        "(c) outliers of extreme size.",
     )
     STEP_REFUSED = (
         "step_refused",
@@ -64,8 +64,8 @@ class Termination(Enum):
         "no_factor_counts",
         False,
         "Stopped: no factor counts. Causes: (a) none can be evaluated at the start (points behind their cameras or in "
-        "their focal plane, lines through camera centres), (b) all have a sqrt_information of zero, (c) all lie beyond "
-        "a loss that rejects them (take a wider loss_scale). Nothing was moved; check poses, landmarks and noise.",
+        "their focal plane, lines through camera centres), (b) all have a weight of zero, (c) a loss "
+        "rejects all of them (take a wider one). Nothing was moved; check poses, landmarks and noise.",
     )
     NOTHING_TO_DO = ("nothing_to_do", True, "Nothing to solve: there are no factors, or everything is held constant.")
     STOPPED_BY_CALLER = (

@@ -22,6 +22,7 @@ from groma.geometry import se3
 from groma.geometry.incidence import closest_points
 from groma.geometry.line3 import from_point_and_direction
 from groma.scene import Scene
+from groma.scene.local_frame import up_of
 from groma.scene.patches import plane_patches
 
 #: Step along the image of a line that gives its direction, radians.
@@ -43,6 +44,8 @@ class Drawable:
     #: (N, 7) poses of the images.
     cam_from_world: FloatArray
     image_names: list[str]
+    #: (3,) the direction that is up.
+    up: FloatArray
     #: (N, 2) width and height of the images, pixels; zero where unknown.
     image_sizes: IntArray
     #: (M, 2) residuals in pixels, predicted minus measured, of points and line ends; NaN behind the camera.
@@ -96,6 +99,7 @@ def drawable(scene: Scene) -> Drawable:
         patch_members=members,
         cam_from_world=scene.cam_from_world,
         image_names=list(scene.images.names),
+        up=up_of(scene),
         image_sizes=np.stack([scene.cameras.width, scene.cameras.height], axis=1)[camera_idx],
         residuals=np.concatenate([point_residuals, line_residuals]),
         residual_place=np.concatenate([points.pixel, line_places]),

@@ -17,7 +17,6 @@ import numpy as np
 
 from groma._typing import BoolArray, FloatArray
 from groma.io.drawn import typical_gap
-from groma.scene.local_frame import upward
 from groma.viz.drawable import Drawable
 
 #: Shares of landmarks and of cameras, nearest to the middle first, that are considered.
@@ -33,7 +32,7 @@ OPENING = np.array([0.83, 0.6])
 MARGIN = 1.06
 #: Factor by which the distance may grow for the cameras to be in the picture.
 FOR_CAMERAS = 1.15
-#: Angle aside and above, radians.
+#: Angle aside, and least angle above, radians; of photographs from higher up half of theirs.
 ASIDE, ABOVE = 0.45, 0.38
 
 
@@ -72,10 +71,11 @@ def starting_view(scene: Drawable, middle: FloatArray) -> StartingView:
         )
     ]
     places = np.concatenate(kept)
-    up = upward(scene.world_from_cam_axes[:, 1])
+    up = scene.up
     back = kept[2].mean(axis=0) - center if len(kept[2]) else np.array([1.0, 1.0, 0.0])
     first, second = horizontal(up)
-    azimuth, elevation = float(np.arctan2(back @ second, back @ first)) + ASIDE, ABOVE
+    azimuth = float(np.arctan2(back @ second, back @ first)) + ASIDE
+    elevation = max(ABOVE, 0.5 * float(np.arcsin(back @ up / (np.linalg.norm(back) or 1.0))))
     back = np.cos(elevation) * (np.cos(azimuth) * first + np.sin(azimuth) * second) + np.sin(elevation) * up
     right = np.cross(up, back) / np.cos(elevation)
     frame = np.stack([right, np.cross(back, right), back])

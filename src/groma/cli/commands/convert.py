@@ -16,6 +16,13 @@ from groma.errors import InputError
 if TYPE_CHECKING:
     from groma.scene import Scene
 
+#: What files of geometry hold; others hold everything.
+_LANDMARKS = ("points", "lines", "planes")
+_KINDS = {
+    **dict.fromkeys((".ply", ".obj"), _LANDMARKS),
+    **dict.fromkeys((".dxf", ".glb", ".gltf"), ("images", *_LANDMARKS)),
+}
+
 
 def convert(
     console: Console,
@@ -64,10 +71,10 @@ def _convert(source: Path, target: Path, console: Console, force: bool) -> dict[
         scene = convert_scene(source, target, force)
     if target.suffix.lower() == ".json":  # cameras, poses and points
         scene = scene.points_only().keep(point_observations=[])
-    geometry = target.suffix.lower() in (".ply", ".obj", ".dxf")
-    console.wrote(f"{target}: {sentence_of(scene, geometry=geometry)}")
+    kinds = _KINDS.get(target.suffix.lower(), ())
+    console.wrote(f"{target}: {sentence_of(scene, *kinds)}")
     warnings = [*_missing_images(source, scene), *_unknown_sizes(scene, target), *_unseen_points(source, scene, target)]
-    warnings = [] if geometry else warnings
+    warnings = [] if kinds else warnings
     for sentence in warnings:
         console.warn(sentence)
     return {**counts_of(scene), "warnings": warnings}

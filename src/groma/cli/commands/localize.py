@@ -108,7 +108,7 @@ def localize(
     _output.check_output(output, force)
     with console.stages() as say:
         say(WRITING, 0, 1)
-        result.write(output, files, f"Photographs in {map_.absolute().name}", force=force)
+        result.write(output, files, f"Photographs in {_output.subject(map_)}", force=force)
     shutil.rmtree(work, ignore_errors=True)
     _say(console, result)
     console.wrote_page(output)

@@ -229,7 +229,7 @@ def map_(
         page = {"images": photographs, "photographs": result.photographs(photographs)}
         found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
         numbers = result.summary(found, result.contributions(true) if contributions else ())
-        page |= {"title": f"Map of {images.absolute().name}", "summary": numbers}
+        page |= {"title": f"Map of {_output.subject(images)}", "summary": numbers}
         write_map(console, result, output, work, force, **page)
     end_queries(output)
     say_map(console, result, numbers)

@@ -57,7 +57,7 @@ def merge(
     result = replace(result, **{name: merged.with_lines(getattr(result, name)) for name in ("scene", "before")})
     kept = result.scene.num_lines - anew
     numbers = {**result.summary(), "merged": merged.sentence(), "num_kept_lines": kept}
-    title = f"Map of {first.absolute().name} and {second.absolute().name}"
+    title = f"Map of {_output.subject(first)} and {_output.subject(second)}"
     write_map(console, result, output, work, force, images=merged.folder, title=title, summary=numbers)
     say_map(console, result, numbers, explain=False)
     if kept:

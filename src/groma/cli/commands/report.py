@@ -59,6 +59,6 @@ def report(
     with _output.atomic_output(output, force) as draft:
         told = {} if saved is None else {"outcomes": saved.outcomes, "explanation": saved.explanation}
         contents = PageContents(**told, covariances=found)
-        write_report(draft, earlier, scene, saved, images, source.absolute().name, contents)
+        write_report(draft, earlier, scene, saved, images, _output.subject(source), contents)
     console.wrote(output)
     _output.write_json(console.json_target, {"output": str(output), **counts_of(scene)}, force)

@@ -134,7 +134,7 @@ def track(
         say(WRITING, 0, 1)
         files = getattr(frames, "pictures", {})  # of a video there are none
         pictures = {name: files[name] for name in result.scene.images.names if name in files}
-        unwritten = result.write(output, f"Track of {sequence.absolute().name}", force, pictures or None)
+        unwritten = result.write(output, f"Track of {_output.subject(sequence)}", force, pictures or None)
     for sentence in unwritten:
         console.warn(sentence)
     remove_stages(work)

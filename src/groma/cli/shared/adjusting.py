@@ -151,7 +151,7 @@ def _write_page(
         cards=contributions_card(numbers.get("contributions")) + survey_card(numbers.get("survey")),
         covariances=None if found is None else covariances_of(result.scene, found),
     )
-    title = f"Adjustment of {source.absolute().name}"
+    title = f"Adjustment of {_output.subject(source)}"
     with _output.atomic_output(path, force) as draft:
         write_report(draft, before, result.scene, result.report, title=title, contents=contents)
 

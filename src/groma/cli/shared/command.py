@@ -53,6 +53,10 @@ NoColor = Annotated[bool, GENERAL.option("Use no colours; so does the environmen
 NoSeed = Annotated[int, typer.Option("--seed", min=0, hidden=True)]
 
 
+#: Stands for hyphens while help is wrapped: names of options are not broken.
+_HYPHEN = "\u2011"
+
+
 class Command(TyperCommand):
     """A command whose help has headings and which suggests the nearest choice for a misspelled value."""
 
@@ -67,6 +71,10 @@ class Command(TyperCommand):
                 pieces.append(f"{min(one.opts, key=len)} {one.metavar}")
         return pieces
 
+    def get_help(self, ctx: Any) -> str:
+        """Return the help, wrapped at spaces alone."""
+        return super().get_help(ctx).replace(_HYPHEN, "-")
+
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the options under their headings, in order of first appearance."""
         sections: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
@@ -77,7 +85,7 @@ class Command(TyperCommand):
                 if parameter.param_type_name == "argument":
                     name = parameter.metavar or parameter.name  # the help says what kind of value
                 name = re.sub(r"[<\[]([\w|]+)[>\]]$", r"\1", name)  # choices: one|another
-                sections.setdefault(_heading(parameter), []).append((name, text))
+                sections.setdefault(_heading(parameter), []).append((name, text.replace("-", _HYPHEN)))
         for heading, records in sections.items():
             if records:
                 with formatter.section(heading):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Writing results: atomically, and never over an existing file without --force."""
 
+import os
 import re
 import tempfile
 from collections.abc import Iterator
@@ -18,6 +19,15 @@ _RESULTS = re.compile(
 
 #: Files that a running track keeps (:mod:`groma.tracking.journal`).
 _JOURNAL = {"frames.txt", "keyframes.txt", "statuses.txt", "trajectory.txt", "scene.npz", "now.npz", "now.draft"}
+
+#: Ends of paths that are the same in every project, of COLMAP's and others' layouts.
+_OF_LAYOUTS = re.compile(r"(/(sparse(/\d+)?|dense|images?|photos|photographs|frames|model))+$", re.IGNORECASE)
+
+
+def subject(path: Path) -> str:
+    """Return a name for headings: ``castle`` for ``castle/images`` and ``castle/sparse/0``."""
+    whole = Path(os.path.abspath(path))  # also of .. and .
+    return Path(_OF_LAYOUTS.sub("", whole.as_posix())).name or whole.name
 
 
 def check_outputs(

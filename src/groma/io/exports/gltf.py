@@ -27,7 +27,6 @@ from groma.io.drawn import Colours, DrawnCameras, drawn, drawn_cameras, light, m
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Scene
 from groma.scene.checks import check_scene_given
-from groma.scene.local_frame import upward
 from groma.scene.patches import triangle_fans
 
 _FLOAT, _UNSIGNED_BYTE, _UNSIGNED_INT = 5126, 5121, 5125
@@ -112,6 +111,8 @@ def _document(scene: Scene) -> _Document:
     document.add("nodes", top)
 
     def node(**entry: Any) -> None:
+        if "mesh" in entry:  # readers name geometry by node or by mesh
+            document.content["meshes"][entry["mesh"]]["name"] = entry["name"]
         top["children"].append(document.add("nodes", entry))
 
     plain = document.add("materials", {"name": "colours", "extensions": {"KHR_materials_unlit": {}}})
@@ -173,7 +174,7 @@ def _glass(colour: list[int]) -> dict[str, Any]:
 
 def _upright(shown: DrawnCameras) -> list[float]:
     """Return the quaternion [x y z w] that turns the up direction of the photographs to +y."""
-    up = upward(shown.world_from_cam[:, :3, 1])
+    up = shown.up
     axis = np.cross(up, [0.0, 1.0, 0.0])
     if up[1] < -1.0 + 1e-12:
         return [1.0, 0.0, 0.0, 0.0]

@@ -22,7 +22,6 @@ from groma.io.drawn import Drawn, DrawnCameras, drawn, drawn_cameras, middle_of
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Scene
 from groma.scene.checks import check_scene_given
-from groma.scene.local_frame import upward
 from groma.scene.patches import triangle_fans
 
 #: Width of an image where it is not known, pixels.
@@ -60,7 +59,7 @@ def write_recording(scene: Scene, path: str | os.PathLike[str], force: bool = Fa
         stream = rerun.RecordingStream("groma", recording_id="scene")
         stream.save(draft)
         shift = middle_of(shown, images)
-        axis = "XYZ"[int(np.argmax(np.abs(up := upward(images.world_from_cam[:, :3, 1]))))]
+        axis = "XYZ"[int(np.argmax(np.abs(up := images.up)))]
         way = "UP" if up["XYZ".index(axis)] > 0 else "DOWN"
         stream.log("world", getattr(rerun.ViewCoordinates, f"RIGHT_HAND_{axis}_{way}"), static=True)
         stream.log("world", rerun.AnyValues(shift=shift), static=True)

@@ -108,7 +108,8 @@ def explain(line_map: LineMap, num_left_out: int = 0, min_confidence: float = 0.
     if others:
         parts.append(f"{others:,} ({_percent(others, total)}) were lost for other reasons")
     start = "The map is empty" if line_map.num_lines == 0 else "Of the segments on no line"
-    return f"{head} {start}: {'; '.join(parts)}. What would help most: {REMEDIES[lost[0][1]]}."
+    remedy = next((f" What would help most: {REMEDIES[outcome]}." for _, outcome in lost if outcome in REMEDIES), "")
+    return f"{head} {start}: {'; '.join(parts)}.{remedy}"
 
 
 def _lines(number: int) -> str:

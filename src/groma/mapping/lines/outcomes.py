@@ -59,7 +59,7 @@ WORDS = {
     Outcome.TEXTURE: "lay on lines of short, weak segments that few of the images show that should: likely texture",
 }
 
-#: What would help.
+#: What would help; segments of texture are left out on purpose.
 REMEDIES = {
     Outcome.TOO_SHORT: "a smaller least length (--min-length), or larger images",
     Outcome.NO_NEIGHBOR: "photographs that overlap more, or a model with more points",
@@ -72,7 +72,6 @@ REMEDIES = {
     Outcome.OUTLIER: "better poses and calibration (--refine-intrinsics estimates a given one)",
     Outcome.FEW_IMAGES: "more photographs of the same parts",
     Outcome.UNCERTAIN: "photographs from further apart",
-    Outcome.SHORT_LINE: "larger images; from Python, a smaller MapLinesOptions.min_longest",
+    Outcome.SHORT_LINE: "larger images",
     Outcome.REPEATED: "photographs from nearer, which show edges close to each other as two",
-    Outcome.TEXTURE: "nothing, unless lines of texture are wanted: from Python, MapLinesOptions.min_repeatability = 0",
 }

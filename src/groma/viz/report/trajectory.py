@@ -20,7 +20,8 @@ from groma.evaluation.trajectory import TrajectoryScores, apply_similarity
 from groma.geometry import quaternion
 from groma.io.trajectories import Trajectory
 from groma.scene import Scene
-from groma.viz.framing import horizontal, upward
+from groma.scene.local_frame import upward
+from groma.viz.framing import horizontal
 from groma.viz.pictures import ImageFiles
 from groma.viz.report import digits as _digits
 from groma.viz.report import tables as _page_tables
@@ -182,7 +183,7 @@ def _path_cards(track: Track, scores: TrajectoryScores | None) -> str:
     if scores is not None:
         curves.append(("reference", "var(--before)", scores.timestamps, scores.reference))
     turn = quaternion.to_matrix(poses[:, :4])
-    up = upward(turn[:, :, 1])
+    up = upward(turn.transpose(0, 2, 1))
     axes = _axes(poses[:, 4:], up)
     keyframes = poses[np.isin(times, track.keyframes), 4:]
     cards = ""

@@ -17,7 +17,7 @@ from groma.geometry import quaternion
 from groma.io.drawn import openings
 from groma.scene import Scene
 from groma.scene.line_intervals import line_pieces
-from groma.scene.local_frame import upward
+from groma.scene.local_frame import up_of
 from groma.scene.similarity import Similarity
 from groma.viz import colours as _colours
 from groma.viz.colours import Colours
@@ -220,7 +220,7 @@ def _frame(scene: Scene) -> tuple[Similarity, FloatArray, FloatArray]:
     if len(centers):
         reach = max(reach, float(np.median(np.linalg.norm(centers - middle, axis=1))))
     scale = REACH / reach if reach > 0 else 1.0
-    up = upward(quaternion.to_matrix(scene.cam_from_world[:, :4])[:, 1])
+    up = up_of(scene)
     away = centers.mean(axis=0) - middle if len(centers) else np.array([1.0, 1.0, 0.0])
     away = away - (away @ up) * up
     if np.linalg.norm(away) < 0.15 * reach:
