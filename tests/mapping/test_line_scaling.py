@@ -13,6 +13,7 @@ from groma.features.segments import SEGMENTS
 from groma.mapping.groups import distinct_pairs, num_distinct
 from groma.mapping.lines.line_map import LineMap, explain
 from groma.mapping.lines.linking import merge as _line_merge
+from groma.mapping.lines.linking.fit import find_on_lines, near_together
 from groma.mapping.lines.linking.merge import MergeGates
 from groma.mapping.lines.outcomes import REMEDIES, WORDS, Outcome
 from groma.mapping.unused import without_unused
@@ -66,6 +67,50 @@ def test_near_pairs_are_those_of_all_pairs(size):
     }
     assert len(pairs) >= 20
     assert ((span >= 0.0) & (span <= 1.0)).all()
+
+
+def on_line(camera, line, ends, sigma, forward, gate):
+    """Squared distance over sigma of a segment that is on a line in an image, None where it is not, in plain words."""
+    start, end = (p[:2] / p[2] for p in np.column_stack([line, np.ones(2)]) @ camera.T)
+    along = (end - start) / (length := np.linalg.norm(end - start))
+    away = (ends - start) @ [along[1], -along[0]]
+    t = (ends - start) @ along
+    overlap = min(t.max(), length) - max(t.min(), 0.0)
+    squared = away @ away / sigma**2
+    fits = overlap >= max(0.5 * min(np.ptp(t), length), 5.0) and forward * (t[1] - t[0]) >= 0.0
+    return squared if fits and squared <= gate else None
+
+
+@pytest.mark.kernels
+@pytest.mark.parametrize(("size", "count"), [(100.0, 0), (100.0, 3), (100.0, 40), (1000.0, 300)])
+def test_segments_on_lines_are_those_of_all_pairs(size, count):
+    """Some segments lie on lines, of any length, some are not to be looked at."""
+    rng, gate = np.random.default_rng(count), 12.0
+    lines = np.concatenate([rng.uniform(-1, 1, (60, 2, 2)), rng.uniform(1.5, 3.0, (60, 2, 1))], axis=2)
+    lines[0, 0, 2] = -1.0  # begins behind the camera
+    camera = np.array([[size, 0.0, size, 0.0], [0.0, size, size, 0.0], [0.0, 0.0, 1.0, 0.0]])
+    pixel = lines @ camera[:, :3].T
+    pixel = pixel[..., :2] / pixel[..., 2:]
+    part = rng.uniform(-0.5, 1.5, (count, 2, 1))
+    on = pixel[rng.integers(0, 60, count)]
+    ends = (on[:, :1] + part * (on[:, 1:] - on[:, :1]) + rng.normal(0, 0.5, (count, 2, 2))).reshape(-1, 4)
+    sigma, usable = rng.uniform(0.1, 0.8, count), rng.random(count) < 0.9
+    forward = rng.choice([-1.0, 0.0, 1.0], 60)
+    expected = {
+        (n, s): squared
+        for n in range(1, 60)
+        for s in np.flatnonzero(usable).tolist()
+        if (squared := on_line(camera, lines[n], ends[s].reshape(2, 2), sigma[s], forward[n], gate)) is not None
+    }
+    order = near_together(ends, usable)
+    np.testing.assert_array_equal(np.sort(order), np.flatnonzero(usable))
+    for room in (0, 5, 4096):
+        found, squared = np.empty((room, 2), np.int64), np.empty(room)
+        needed = find_on_lines(camera, lines, order, ends, sigma, forward, gate, 0.5, 5.0, found, squared)
+        assert needed == len(expected)
+    assert [tuple(pair) for pair in found[:needed].tolist()] == sorted(expected)
+    np.testing.assert_allclose(squared[:needed], [expected[pair] for pair in sorted(expected)], rtol=1e-7, atol=1e-9)
+    assert needed >= count // 10
 
 
 @pytest.mark.kernels

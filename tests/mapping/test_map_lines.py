@@ -266,6 +266,10 @@ def test_angle_about_the_baseline_is_that_of_the_epipolar_plane():
     two = angles_about_baseline(X - second, second - first)
     np.testing.assert_allclose(one, two, atol=1e-12)
     assert (one[:, 1] >= one[:, 0]).all()
+    np.testing.assert_allclose(angles_about_baseline(X[:, ::-1] - first, second - first), one * [1, 1, -1], atol=1e-12)
+    assert (np.abs(one[:, 2]) == 1.0).all()
+    along = X[:1, :1] + np.array([0.0, 0.1])[:, None] * (X[0, 0] - first)  # of the same epipolar plane
+    assert angles_about_baseline(along - first, second - first)[0, 2] == 0.0
 
 
 def test_empty_maps_say_why(world):

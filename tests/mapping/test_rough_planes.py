@@ -10,7 +10,7 @@ from groma.estimators.plane_search import PlaneSet
 from groma.gates import chi_square_gate
 from groma.mapping.noise.landmarks import LineNoise, PointNoise
 from groma.mapping.structure.relations import Landmarks, on_planes, spacings
-from groma.mapping.structure.rough_planes import on_fitted_planes
+from groma.mapping.structure.rough_planes import _spread, on_fitted_planes
 from groma.scene import LineIntervals
 
 SIGMA, LEVEL, LEAST, SUPPORT = 0.002, 0.99, (0.7, 0.9), 20
@@ -215,3 +215,18 @@ def test_cuts_turned_against_each_other_are_pieces_of_a_wall_and_parallel_ones_a
         # The root mean square of heights that are even over a strip, pixels; deviations are tried in steps of 1.4.
         assert 1.0 / 1.2 < points.deviation.max() / (100.0 * slope / np.sqrt(12.0)) < 1.2
         assert np.abs(planes.planes[0, :2]).max() < slope / 5.0
+
+
+def test_turns_scatter_as_expected_with_the_variance_found():
+    rng = np.random.default_rng(0)
+    for number in range(2, 8):
+        roots = rng.normal(size=(number, 2, 2)) * 1e-3
+        noise, turned = roots @ roots.mT + 1e-8 * np.eye(2), rng.normal(size=(number, 2)) * 0.01
+        spread = _spread(turned, noise, 2 * number - 2)
+        information = np.linalg.inv(noise + spread * np.eye(2))
+        mean = np.linalg.solve(information.sum(axis=0), np.einsum("kab,kb->a", information, turned))
+        chi_square = np.einsum("ka,kab,kb->", turned - mean, information, turned - mean)
+        assert spread > 0.0
+        assert chi_square == pytest.approx(2 * number - 2, rel=1e-9)
+    assert _spread(turned * 1e-3, noise, 2 * number - 2) == 0.0  # within their noise
+    assert _spread(turned[:1], noise[:1], 0) == 0.0

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-import scipy.sparse.csgraph
 
 from groma.factors import PointReprojection
 from groma.factors.contract import Ref
@@ -13,7 +12,7 @@ from groma.geometry.charts.pose_charts import PoseLeft
 from groma.geometry.manifold import Euclidean
 from groma.problem.lay_out import lay_out
 from groma.problem.problem import Problem
-from groma.problem.sorting import PairTable, argsort_by, connected_parts, distinct_pairs, first_and_last
+from groma.problem.sorting import PairTable, argsort_by, distinct_pairs, first_and_last
 from groma.problem.variables import Variables
 
 pytestmark = pytest.mark.kernels
@@ -179,17 +178,3 @@ def test_sorted_factors_keep_what_belongs_to_their_rows():
         np.testing.assert_array_equal(layout.factor.pose.index, camera[original])
         if isinstance(factor, _Weighted):
             np.testing.assert_array_equal(layout.factor.total, layout.factor.pixels.sum(axis=1))
-
-
-@pytest.mark.parametrize("num_pairs", [0, 30, 60, 200])
-def test_connected_parts_are_those_of_scipy(num_pairs):
-    """Numbered alike, too: clusters are adjusted in this order."""
-    first, second = np.random.default_rng(num_pairs).integers(0, 80, (2, num_pairs))
-    graph = scipy.sparse.coo_matrix((np.ones(num_pairs), (first, second)), shape=(80, 80))
-    expected = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
-    np.testing.assert_array_equal(connected_parts(first, second, 80), expected)
-
-
-def test_a_long_chain_in_any_order_is_one_part():
-    order = np.random.default_rng(0).permutation(5000)
-    assert (connected_parts(order[:-1], order[1:], 5000) == 0).all()

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from groma._connected import connected_parts
 from groma._trees import kd_tree
 from groma._typing import FloatArray
 from groma.features.segments import SEGMENTS
@@ -47,9 +48,6 @@ def merge_collinear(ends: FloatArray, gates: MergeGates = MERGES) -> FloatArray:
     (M, 4) float64
         Pieces that stand alone, unchanged and in order, then the joined ones. M <= N.
     """
-    from scipy.sparse import coo_matrix  # takes a quarter of a second to import
-    from scipy.sparse.csgraph import connected_components
-
     ends = np.asarray(ends, dtype=np.float64)
     if len(ends) < 2:
         return ends.copy()
@@ -66,9 +64,9 @@ def merge_collinear(ends: FloatArray, gates: MergeGates = MERGES) -> FloatArray:
     parallel = (along[first] * along[second]).sum(axis=1) > np.cos(gates.angle)
     joined = (first != second) & parallel & (across < SEGMENTS.edge) & (ahead > -gates.overlap)
     first, second = first[joined], second[joined]
-    graph = coo_matrix((np.ones(len(first)), (first, second)), shape=(len(ends), len(ends)))
-    count, group = connected_components(graph, directed=False)
-    size = np.bincount(group, minlength=count)
+    group = connected_parts(first, second, len(ends))
+    size = np.bincount(group)
+    count = len(size)
 
     # Line of each group: mean and principal direction of the end points, weighted by length.
     points, owner = ends.reshape(-1, 2), np.repeat(group, 2)

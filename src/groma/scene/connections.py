@@ -8,6 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
+from groma._connected import connected_parts
 from groma._typing import IntArray
 from groma.scene.scene import Scene
 
@@ -20,9 +21,6 @@ def connected_images(scene: Scene) -> list[IntArray]:
 
     Images that see nothing are groups of their own.
     """
-    from scipy.sparse import coo_matrix  # takes a quarter of a second to import
-    from scipy.sparse.csgraph import connected_components
-
     counts = [len(getattr(scene, name)) for name in _NODES]
     first = dict(zip(_NODES, np.cumsum([0, *counts]).tolist(), strict=False))
     pairs = [np.zeros((0, 2), np.int64)]
@@ -42,8 +40,7 @@ def connected_images(scene: Scene) -> list[IntArray]:
             else:
                 places += own
         pairs += [np.column_stack(two) for two in combinations(places, 2)]
-    rows = np.concatenate(pairs)
-    size = sum(counts)
-    _, label = connected_components(coo_matrix((np.ones(len(rows)), rows.T), (size, size)), directed=False)
+    one, other = np.concatenate(pairs).T
+    label = connected_parts(one, other, sum(counts))
     groups = [np.flatnonzero(label[: scene.num_images] == one) for one in np.unique(label[: scene.num_images])]
     return sorted(groups, key=len, reverse=True)

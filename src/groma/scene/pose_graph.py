@@ -8,6 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from groma._connected import connected_parts
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
 from groma.geometry import se3
@@ -71,12 +72,7 @@ class PoseGraph:
 
     def parts(self) -> IntArray:
         """Return the connected part (N,) that each pose belongs to, numbered from 0."""
-        from scipy.sparse import coo_matrix  # takes a quarter of a second to import
-        from scipy.sparse.csgraph import connected_components
-
-        count = len(self.poses)
-        edges = np.ones(len(self.motions)), (self.motions.first_idx, self.motions.second_idx)
-        return connected_components(coo_matrix(edges, shape=(count, count)), directed=False)[1].astype(np.int64)
+        return connected_parts(self.motions.first_idx, self.motions.second_idx, len(self.poses))
 
     def chained(self) -> Self:
         """Return the graph with all poses composed from motions, along shortest paths from the first of each part.
@@ -95,7 +91,7 @@ class PoseGraph:
 
     def _shortest_paths(self) -> tuple[IntArray, IntArray]:
         """Return the pose before each pose and the motion used, forwards, then backwards; the first have themselves."""
-        from scipy.sparse import coo_matrix
+        from scipy.sparse import coo_matrix  # takes a quarter of a second to import
         from scipy.sparse.csgraph import breadth_first_order
 
         count, edges = len(self.poses), len(self.motions)

@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from groma._connected import connected_parts
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assemble import POINT_FACTORS
 from groma.adjustment.rescue.restart import GATES, triangulated_anew, went_elsewhere, with_cameras
@@ -21,7 +22,6 @@ from groma.adjustment.terms.lines import LINE_FACTORS
 from groma.factors.contract import Factor, Ref
 from groma.problem.problem import Problem
 from groma.problem.residuals import squared_norms
-from groma.problem.sorting import connected_parts
 from groma.problem.variables import Variables
 from groma.scene import Scene
 from groma.solver.options import SolverOptions

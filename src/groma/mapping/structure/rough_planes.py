@@ -24,7 +24,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-import scipy  # its parts are imported when something of them is first used
 
 from groma._typing import FloatArray, IntArray
 from groma.estimators.plane_fit import PlaneFit, fit_plane, plane_motions
@@ -200,14 +199,20 @@ def _turned(basis: FloatArray, planes: PlaneSet, group: list[int]) -> tuple[Floa
 
 
 def _spread(turned: FloatArray, noise: FloatArray, expected: float) -> float:
-    """Variance by which turns (K, 2) scatter beyond their noise: with it their chi-square is what is expected."""
+    """Variance by which turns (K, 2) scatter beyond their noise: with it their chi-square is what is expected.
 
-    def excess(variance: float) -> float:
+    The chi-square about the mean falls with the variance and is convex: Newton's steps from zero never pass the root.
+    """
+    variance = 0.0
+    while True:
         information = np.linalg.inv(noise + variance * np.eye(2))
         mean = np.linalg.solve(information.sum(axis=0), np.einsum("kab,kb->a", information, turned))
-        return float(np.einsum("ka,kab,kb->", turned - mean, information, turned - mean)) - expected
-
-    return 0.0 if excess(0.0) <= 0.0 else float(scipy.optimize.brentq(excess, 0.0, 1.0))
+        pull = np.einsum("kab,kb->ka", information, turned - mean)
+        excess = float(np.einsum("ka,ka->", turned - mean, pull)) - expected
+        step = excess / max(float((pull**2).sum()), 1e-300)
+        if expected <= 0.0 or not step > 1e-12 * variance:  # nothing is expected of a plane alone
+            return variance
+        variance += step
 
 
 def _as_one(planes: PlaneSet, group: list[int]) -> PlaneSet:

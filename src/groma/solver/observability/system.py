@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from groma._connected import connected_parts
 from groma._typing import BoolArray, FloatArray
-from groma.problem.sorting import connected_parts
 from groma.solver.linear.blocks import Blocks
 from groma.solver.linear.modes import Modes, divided, scaled
 from groma.solver.observability.findings import Finding, few, first_upper

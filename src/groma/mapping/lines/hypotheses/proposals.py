@@ -41,6 +41,8 @@ from groma.mapping.lines.views import LineViews
 
 #: Bins of the angle about the baseline: only how long it takes depends on them (cost: memory against time).
 _NUM_BINS = 2048
+#: Radians about the baseline from which on it is sure which ray of a segment comes first (derived from rounding).
+_SURE = 1e-6
 # How far a candidate got; the best of all candidates of a segment is reported.
 NOTHING, OUT_OF_BEAM, WEAK, PROPOSED = 0, 1, 2, 3
 #: Proposals of a segment by one other image for which there is room at first; what is not written takes no memory
@@ -186,6 +188,9 @@ def _propose_beam(
             if not abs(gain[j]) * (q_high - q_low) > limits[0] * sigma[r]:
                 furthest = max(furthest, WEAK)  # the whole range of depths lies within the noise
                 continue
+            if directed and beam_i[i, 2] * beam_j[j, 2] < 0.0:  # one of them is crossed from its end
+                furthest = max(furthest, OUT_OF_BEAM)
+                continue
             if not _reach(b, line, r, -1.0 / gain[j], q_low, q_high, limits, work):
                 furthest = max(furthest, OUT_OF_BEAM)
                 continue
@@ -252,7 +257,9 @@ def _bin_beams(beams, pointers, members):
 
 # ------------------------------------------------------------------------------------------------------------- Public
 def angles_about_baseline(ray: FloatArray, baseline: FloatArray) -> FloatArray:
-    """Intervals (n, 2) of the angles about a baseline that segments with rays (n, 2, 3) cover, low first.
+    """Intervals (n, 3) of the angles about a baseline that segments with rays (n, 2, 3) cover, low first.
+
+    The third column is 1 where the first ray has the lower angle, -1 where the second has, 0 where that is not sure.
 
     The angle of a ray about the baseline is the same for all points of an epipolar plane, whichever of the two images
     they are seen in. Intervals start in [-pi, pi) and are at most pi wide.
@@ -263,7 +270,8 @@ def angles_about_baseline(ray: FloatArray, baseline: FloatArray) -> FloatArray:
     turn -= 2 * np.pi * np.floor(turn / (2 * np.pi) + 0.5)
     low = np.where(turn < 0, angle[:, 0] + turn, angle[:, 0])
     low -= 2 * np.pi * np.floor(low / (2 * np.pi) + 0.5)
-    return np.column_stack([low, low + np.abs(turn)])
+    width = np.abs(turn)
+    return np.column_stack([low, low + width, np.sign(turn) * ((width > _SURE) & (width < np.pi - _SURE))])
 
 
 @dataclass(frozen=True, eq=False)
@@ -367,4 +375,10 @@ def _sorted_beams(beam_i: FloatArray, beam_j: FloatArray) -> tuple[FloatArray | 
         _bin_beams(beam_j, pointers, members)
     order = np.argsort(beam_j[:, 0], kind="stable")
     first = beam_j[order, 0]
-    return beam_j, pointers, members, order, np.searchsorted(np.append(first, first + 2.0 * np.pi), beam_i, "right")
+    return (
+        beam_j,
+        pointers,
+        members,
+        order,
+        np.searchsorted(np.append(first, first + 2.0 * np.pi), beam_i[:, :2], "right"),
+    )

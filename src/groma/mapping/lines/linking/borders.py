@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from groma._connected import connected_parts
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.mapping.groups import distinct_pairs
 from groma.mapping.lines.gates import AGREEMENT
@@ -122,9 +123,6 @@ def joined(found: Sequence[Found], borders: Borders, views: LineViews, rows: Int
 
 def _groups(versions: _Versions, borders: Borders) -> IntArray:
     """(V,) the smallest version of the same line."""
-    from scipy import sparse
-    from scipy.sparse.csgraph import connected_components
-
     count, cluster = len(versions.cluster), versions.cluster
     first, second, votes = _shared(versions)
     fewer = np.minimum(
@@ -134,11 +132,8 @@ def _groups(versions: _Versions, borders: Borders) -> IntArray:
     good = (votes >= TrackGates.min_common_images) & (votes >= AGREEMENT.min_common * fewer)
     first, second, votes = first[good], second[good], votes[good]
     best = _is_best(first, second, votes, cluster) & _is_best(second, first, votes, cluster)
-    pairs = np.ones(int(best.sum()), np.int8), (first[best], second[best])
-    _, label = connected_components(sparse.csr_array(pairs, shape=(count, count)), directed=False)
-    smallest = np.full(int(label.max(initial=-1)) + 1, count)
-    np.minimum.at(smallest, label, np.arange(count))
-    return smallest[label]
+    label = connected_parts(first[best], second[best], count)
+    return np.unique(label, return_index=True)[1][label]
 
 
 def _num_known(versions: _Versions, which: IntArray, known: BoolArray, cluster: IntArray) -> IntArray:

@@ -25,6 +25,9 @@ from groma.mapping.lines.views import LineViews
 #: Scale of the Cauchy loss, in sigma.
 _CAUCHY = 2.0
 _FOUR = width(4)
+#: Segments in a box that lines are compared with (cost: time alone), and pixels by which boxes are larger than these
+#: (derived from rounding).
+_BOX, _MARGIN = 16, 1e-6
 
 
 # ------------------------------------------------------------------------------------------------------------- Refine
@@ -109,16 +112,25 @@ def fit_lines(
 
 # ------------------------------------------------------------------------------------------------------------ Recover
 @loop
-def find_on_lines(P, X, lines, rows, ends, sigma, usable, forward, gate, min_overlap, min_px, found, distance):
-    """Segments (rows) of one image that lie on projections of lines; return the number written, or needed."""
-    count = 0
-    u, v, allowed = ends[rows, 0], ends[rows, 1], gate * sigma[rows] * sigma[rows]
-    for k in range(len(rows)):
-        if not usable[rows[k]]:
-            allowed[k] = -1.0
-    near = np.empty(len(rows), np.bool_)
-    for e in range(len(lines)):
-        n = lines[e]
+def find_on_lines(P, X, order, ends, sigma, forward, gate, min_overlap, min_px, found, distance):
+    """Segments of one image that lie on projections of lines; return the number written, or needed.
+
+    ``order`` holds the segments to look at, near ones together: lines are compared with boxes around a few of them at a
+    time. Those of a line are written in the order of their numbers.
+    """
+    count, boxes = 0, -(-len(order) // _BOX)
+    x, y, w, h, reach = np.empty(boxes), np.empty(boxes), np.empty(boxes), np.empty(boxes), np.empty(boxes)
+    for b in range(boxes):
+        left, right, top, bottom, largest = np.inf, -np.inf, np.inf, -np.inf, 0.0
+        for k in range(b * _BOX, min((b + 1) * _BOX, len(order))):
+            s = order[k]
+            left, right = min(left, ends[s, 0], ends[s, 2]), max(right, ends[s, 0], ends[s, 2])
+            top, bottom = min(top, ends[s, 1], ends[s, 3]), max(bottom, ends[s, 1], ends[s, 3])
+            largest = max(largest, sigma[s])
+        x[b], y[b], w[b], h[b] = 0.5 * (left + right), 0.5 * (top + bottom), 0.5 * (right - left), 0.5 * (bottom - top)
+        reach[b] = math.sqrt(gate) * largest + _MARGIN
+    near = np.empty(boxes, np.bool_)
+    for n in range(len(X)):
         x0 = P[0, 0] * X[n, 0, 0] + P[0, 1] * X[n, 0, 1] + P[0, 2] * X[n, 0, 2] + P[0, 3]
         y0 = P[1, 0] * X[n, 0, 0] + P[1, 1] * X[n, 0, 1] + P[1, 2] * X[n, 0, 2] + P[1, 3]
         z0 = P[2, 0] * X[n, 0, 0] + P[2, 1] * X[n, 0, 1] + P[2, 2] * X[n, 0, 2] + P[2, 3]
@@ -133,27 +145,43 @@ def find_on_lines(P, X, lines, rows, ends, sigma, usable, forward, gate, min_ove
         if length < min_px:
             continue
         dx, dy = dx / length, dy / length
-        offset = x0 * dy - y0 * dx
-        for k in range(len(rows)):  # most segments are far away; this loop becomes vector instructions
-            first = u[k] * dy - v[k] * dx - offset
-            near[k] = first * first <= allowed[k]
-        for k in range(len(rows)):
-            if not near[k]:
+        offset, middle, half = x0 * dy - y0 * dx, 0.5 * (x0 + x1) * dx + 0.5 * (y0 + y1) * dy, 0.5 * length + _MARGIN
+        for b in range(boxes):  # most segments are far away; this loop becomes vector instructions
+            across = abs(x[b] * dy - y[b] * dx - offset) - (w[b] * abs(dy) + h[b] * abs(dx) + reach[b])
+            along = abs(x[b] * dx + y[b] * dy - middle) - (w[b] * abs(dx) + h[b] * abs(dy) + half)
+            near[b] = (across <= 0.0) & (along <= 0.0)
+        begin = count
+        for b in range(boxes):
+            if not near[b]:
                 continue
-            s = rows[k]
-            first = (ends[s, 0] - x0) * dy - (ends[s, 1] - y0) * dx
-            second = (ends[s, 2] - x0) * dy - (ends[s, 3] - y0) * dx
-            if first * first + second * second > allowed[k]:
-                continue
-            t0 = (ends[s, 0] - x0) * dx + (ends[s, 1] - y0) * dy
-            t1 = (ends[s, 2] - x0) * dx + (ends[s, 3] - y0) * dy
-            if forward[n] * (t1 - t0) < 0.0:
-                continue
-            overlap = min(max(t0, t1), length) - max(min(t0, t1), 0.0)
-            if overlap < min_overlap * min(abs(t1 - t0), length) or overlap < min_px:
-                continue
-            if count < len(found):
-                found[count, 0], found[count, 1] = n, s
-                distance[count] = (first * first + second * second) / (sigma[s] * sigma[s])
-            count += 1
+            for k in range(b * _BOX, min((b + 1) * _BOX, len(order))):
+                s = order[k]
+                first = (ends[s, 0] - x0) * dy - (ends[s, 1] - y0) * dx
+                second = (ends[s, 2] - x0) * dy - (ends[s, 3] - y0) * dx
+                if first * first + second * second > gate * sigma[s] * sigma[s]:
+                    continue
+                t0 = (ends[s, 0] - x0) * dx + (ends[s, 1] - y0) * dy
+                t1 = (ends[s, 2] - x0) * dx + (ends[s, 3] - y0) * dy
+                if forward[n] * (t1 - t0) < 0.0:
+                    continue
+                overlap = min(max(t0, t1), length) - max(min(t0, t1), 0.0)
+                if overlap < min_overlap * min(abs(t1 - t0), length) or overlap < min_px:
+                    continue
+                if count < len(found):
+                    at = count
+                    while at > begin and found[at - 1, 1] > s:
+                        found[at, 1], distance[at] = found[at - 1, 1], distance[at - 1]
+                        at -= 1
+                    found[count, 0], found[at, 1] = n, s
+                    distance[at] = (first * first + second * second) / (sigma[s] * sigma[s])
+                count += 1
     return count
+
+
+def near_together(ends: FloatArray, usable: BoolArray) -> IntArray:
+    """Order of the usable segments, near ones together: strips of an image, each from top to bottom."""
+    rows = np.flatnonzero(usable)
+    x, y = ends[rows, 0] + ends[rows, 2], ends[rows, 1] + ends[rows, 3]
+    strip = np.empty(len(rows))
+    strip[np.argsort(x)] = np.arange(len(rows)) // (math.isqrt(len(rows) * _BOX) + 1)
+    return rows[np.argsort(strip * (2.0 * np.ptp(y) + 1.0) + y)] if len(rows) else rows

@@ -28,7 +28,7 @@ from groma.features.segments import SEGMENTS
 from groma.mapping.groups import distinct_pairs
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.hypotheses.places import Places
-from groma.mapping.lines.linking.fit import find_on_lines
+from groma.mapping.lines.linking.fit import find_on_lines, near_together
 from groma.mapping.lines.linking.link import join_once, link
 from groma.mapping.lines.linking.tracks import Tracks
 from groma.mapping.lines.options import MapLinesOptions
@@ -138,11 +138,11 @@ def _on_lines_in(
     image: tuple[FloatArray, IntArray, FloatArray, FloatArray, int, tuple[FloatArray, FloatArray, BoolArray]],
 ) -> tuple[IntArray, FloatArray]:
     """The same of one image: its camera, the lines to look for with their ends and directions, and its segments."""
-    camera, lines, ends, forward, first, segments = image
-    every = np.arange(len(lines)), np.arange(len(segments[0]))
+    camera, lines, ends, forward, first, (segments, sigma, usable) = image
+    order = near_together(segments, usable)
     hits, distances = np.empty((4096, 2), np.int64), np.empty(4096)
     while True:
-        needed = find_on_lines(camera, ends, *every, *segments, forward, *gates, hits, distances)
+        needed = find_on_lines(camera, ends, order, segments, sigma, forward, *gates, hits, distances)
         if needed <= len(hits):
             return np.column_stack([lines[hits[:needed, 0]], first + hits[:needed, 1]]), distances[:needed]
         hits, distances = np.empty((needed, 2), np.int64), np.empty(needed)
