@@ -211,11 +211,9 @@ def place_not_in_map(agree: int, again: int, shown: Shown) -> Instead:
     return Instead(odds * math.exp(-min(max(shown.log_odds, -600.0), 600.0)), words, True)
 
 
-def as_good(first: Evidence, second: Evidence | None) -> float:
+def as_good(first: Evidence, second: Evidence) -> float:
     """Probability that a second pose gets so few votes of both if both are equally good."""
-    if second is None or not second.significant:
-        return 0.0
-    return float(_tail(np.array(second.agree), first.agree))
+    return float(_tail(second.agree, first.agree))
 
 
 def doubted_if_mirrored(verdict: Verdict, own: int, mirror: int) -> Verdict:
