@@ -11,7 +11,7 @@ from groma.geometry import se3
 from groma.localization.expected import FoundAgain, nearest_images, shown_of
 from groma.localization.features import unit
 from groma.localization.pose.matches import Matches
-from groma.localization.pose.verdict import Verdict, doubted_if_missing, doubted_if_repeated
+from groma.localization.pose.verdict import Verdict, doubted_if_missing
 from groma.localization.repeated import Described, alike_limits, most_alike, telling_points
 from groma.scene import Cameras
 
@@ -138,37 +138,25 @@ def test_what_only_this_place_has_is_to_be_found_as_often_as_the_rest():
     again = FoundAgain(np.array([[0.0, 0.0, 0.6]] * 2))
 
     def told(chance_telling, chance):
-        return shares(rng.random(1500) < np.where(telling, chance_telling, chance))
-
-    def shares(agree):
+        agree = rng.random(1500) < np.where(telling, chance_telling, chance)
         best, matches = _best(world, agree, np.zeros(1, bool))
         shown = shown_of(scene, index, again, np.arange(2), best, matches, (np.flatnonzero(agree),) * 2)
         assert doubted_if_missing(RIGHT, *shown[:2]) is RIGHT
         return shown
 
     right, wrong = told(0.3, 0.3), told(0.05, 0.425)
-    assert right.alone == pytest.approx(0.82, abs=0.13)  # the lower limit of 150: 123
-    assert right.known
-    assert wrong.alone < 0.05 / 0.3 and not wrong.known
-    assert doubted_if_repeated(RIGHT, right) is RIGHT
-    assert doubted_if_repeated(RIGHT, wrong).status == "uncertain"
-    assert "looks like" in doubted_if_repeated(RIGHT, wrong).sentence
-    assert told(0.0, 0.4).alone == 0.0
-    # Of points that have their like elsewhere, nine of ten views are nearer to them: they tell, and are not unique.
+    assert sum(right.expected) == pytest.approx(150.0, rel=0.1) and sum(right.found) == pytest.approx(150, abs=30)
+    assert sum(wrong.expected) == pytest.approx(150.0, rel=0.1) and sum(wrong.found) == pytest.approx(25, abs=15)
+    assert right.log_odds > 7.0 and wrong.log_odds < -7.0
+    # Of points that have their like elsewhere, nine of ten views are nearer to them: they tell, and less is expected.
     index.telling[:] *= 0.9
-    assert np.isnan(told(0.3, 0.3).alone) and told(0.3, 0.3).known and not told(0.1, 0.4).known
-    # Of 60 telling points 30 are expected, as often as of the others. Another place may have twelve of them, not 25.
-    index.telling[:] = np.arange(1500) < 60
-    half = np.arange(1500) % 2 == 0
-    for found, status in ((12, "uncertain"), (25, "localized")):
-        agree = np.where(index.telling > 0.0, np.arange(1500) < found, half)
-        assert doubted_if_repeated(RIGHT, shares(agree)).status == status
-    doubted = Verdict("uncertain", 0.5, "of something else.")
-    assert doubted_if_repeated(doubted, wrong) is doubted
-    # Too few to say anything.
-    index.telling[:] = np.arange(1500) < 3
-    assert np.isnan(told(0.0, 0.3).alone)
-    assert doubted_if_repeated(RIGHT, told(0.0, 0.3)) is RIGHT
+    assert sum(told(0.3, 0.3).expected) == pytest.approx(135.0, rel=0.1)
+    # A few in one part are counted by themselves, those all over the image are not.
+    left = np.flatnonzero(world.points2d.max(axis=1) < 80)
+    index.telling[:] = np.where(np.isin(np.arange(1500), left), 1.0, np.arange(1500) % 50 == 0)
+    assert told(0.5, 0.5).expected == pytest.approx((15.0, 0.5 * len(left)), rel=0.2)
+    index.telling[:] = 0.0
+    assert told(0.3, 0.3).log_odds == 0.0
 
 
 def test_points_tell_where_nothing_else_in_the_image_is_described_like_them():

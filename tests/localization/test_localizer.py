@@ -294,7 +294,7 @@ def test_command(place, localizer, tmp_path, capsys):
     assert sorted(told) == sorted([*QUERIES, "bad.jpg", "black.png"])
     keys = {
         "status", "qvec", "tvec", "center", "center_sigma", "rotation_sigma_deg", "num_point_inliers",
-        "num_line_inliers", "feature_seconds", "seconds", "sentence", "shared_error_deg",
+        "num_line_inliers", "feature_seconds", "seconds", "sentence", "shared_error_deg", "probability",
     }  # fmt: skip
     assert all(set(entry) == keys for entry in told.values())
     assert told["bad.jpg"]["status"] == told["black.png"]["status"] == "failed"

@@ -5,16 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, nbinom
 from worlds import CAMERA, make_world, pose_of
 
 from groma.geometry import quaternion
 from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose, pose_from_matches
+from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pieces import cells_elsewhere
 from groma.localization.pose.refinement import fitted, refine
-from groma.localization.pose.verdict import Shown, evidence_of, votes_of_a_rival
+from groma.localization.pose.verdict import Shown, evidence_of, place_not_in_map, votes_of_a_rival
 
 
 def _in_pieces(world, rng, moved):
@@ -101,7 +102,7 @@ def test_what_only_one_of_two_places_has_decides_between_them(known):
     poses = [world.pose, second]
 
     def expected(best, used):
-        return Shown(9.0, 0.0, 1.0, *(30 * (nearest(best.pose) in known), 20.0))
+        return Shown(9.0, 0.0, (0, 30 * (nearest(best.pose) in known)), (0.0, 20.0))
 
     def nearest(pose):
         return int(np.argmin([np.linalg.norm(one[4:] - pose[4:]) for one in poses]))
@@ -110,7 +111,9 @@ def test_what_only_one_of_two_places_has_decides_between_them(known):
     if len(known) == 1:
         assert (found.status, nearest(found.cam_from_world)) == ("localized", known[0])
     else:
-        assert found.status == "uncertain" and "Two places" in found.sentence
+        words = "Two places" if known else "another place that looks like"
+        assert found.status == "uncertain" and words in found.sentence
+        assert found.probability == pytest.approx(0.5 if known else 0.0, abs=1e-3)
 
 
 def test_what_is_put_together_of_pieces_is_not_believed():
@@ -124,12 +127,30 @@ def test_what_is_put_together_of_pieces_is_not_believed():
     assert believed == ["localized"] * 5
 
 
-def test_a_place_is_known_beside_another_only_where_more_of_it_is_found():
-    """Eight of 5.5 are well above what other places have, and hardly more than 10 of 11."""
-    first, second = Shown(9.0, 0.0, found=10, expected=11.2), Shown(9.0, 0.0, found=12, expected=5.5)
-    assert second.known and not second.is_known_beside(first)
-    assert Shown(9.0, 0.0, found=22, expected=17.9).is_known_beside(Shown(9.0, 0.0, found=7, expected=23.3))
-    assert not Shown(9.0, 0.0).known and not Shown(9.0, 0.0).is_known_beside(first)
+def test_points_that_tell_a_place_are_weighed_by_their_negative_binomial_distributions():
+    shape = VERDICT.scatter**-2
+    for found, expected in (
+        ((0, 0), (0.0, 0.0)),
+        ((0, 2), (3.0, 1.0)),
+        ((7, 0), (8.7, 0.0)),
+        ((20, 700), (11.2, 900.0)),
+    ):
+        odds = [
+            nbinom.logpmf(k, shape, shape / (shape + E)) - nbinom.logpmf(k, shape, shape / (shape + share * E))
+            for k, E, share in zip(found, expected, VERDICT.elsewhere, strict=True)
+        ]
+        assert Shown(9.0, 0.0, found, expected).log_odds == pytest.approx(sum(odds), rel=1e-9, abs=1e-9)
+
+
+def test_another_place_is_the_more_probable_the_more_the_map_repeats_and_the_less_tells():
+    """Where nothing repeats and nothing tells a pose is believed; half of the cells that repeat are even odds of a
+    half, and missing points count where nothing repeats, too.
+    """
+    assert place_not_in_map(40, 0, Shown()).odds == pytest.approx(5e-4)
+    assert place_not_in_map(40, 20, Shown()).odds == pytest.approx(0.5, abs=1e-3)
+    assert place_not_in_map(40, 90, Shown()).odds == pytest.approx(1.0, abs=1e-3)
+    assert place_not_in_map(40, 0, Shown(found=(2, 0), expected=(12.0, 0.0))).odds > 0.01
+    assert place_not_in_map(40, 40, Shown(found=(0, 18), expected=(0.0, 18.0))).odds < 1e-3
 
 
 def test_what_is_found_at_a_place_that_is_known_is_no_piece_of_another():
@@ -143,14 +164,14 @@ def test_what_is_found_at_a_place_that_is_known_is_no_piece_of_another():
     for near, telling, status in (
         (at_the_place, 30, "localized"),
         (matches, 30, "uncertain"),
-        (at_the_place, 5, "uncertain"),
+        (at_the_place, 0, "uncertain"),
     ):
         found = pose_from_matches(
             CAMERA,
             matches,
             PoseOptions(look_for_rival=False),
             guided=lambda best, near=near: near,
-            expected=lambda best, used, telling=telling: Shown(9.0, 0.0, 1.0, telling, 20.0),
+            expected=lambda best, used, telling=telling: Shown(9.0, 0.0, (0, telling), (0.0, 20.0)),
         )
         assert found.status == status, found.sentence
 

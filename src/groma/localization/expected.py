@@ -8,8 +8,7 @@ them see, and that its pose puts into it, it sees some itself, the more the more
 
 Where a place repeats, another that looks like it shows what repeats in every part. What only this place has is missing
 there: points that tell it from others (:mod:`groma.localization.repeated`), found more like themselves than any other
-place of the map is. They are to be found about as often as all; few of them say little, so what counts is the lower
-limit of how often they are.
+place of the map is. They are to be found about as often as all, and count by themselves where several are in one part.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.refinement import Refined
-from groma.localization.pose.verdict import Shown, at_least
+from groma.localization.pose.verdict import Shown
 from groma.localization.repeated import ALIKE
 from groma.scene import Scene
 
@@ -103,8 +102,7 @@ def shown_of(
     pixel = camera.project(best.pose, index.xyz[point])
     inside = camera.inside(pixel)
     point, pixel, telling = point[inside], pixel[inside], index.telling[point[inside]]
-    unique = telling >= ALIKE
-    rate = again.rate[unique.astype(np.int64), times[inside]]
+    rate = again.rate[(telling >= ALIKE).astype(np.int64), times[inside]]
     expected = [(pixel, rate, VERDICT.expected)]
     if lines and scene.num_lines:
         rows = np.concatenate([np.arange(int(index.segment_begin[i]), int(index.segment_begin[i + 1])) for i in near])
@@ -113,8 +111,11 @@ def shown_of(
     parts = _counted(camera, expected, shown, VERDICT.parts)
     alike, itself = (np.isin(point, some) for some in found)
     often = min(1.0, float(alike.sum()) / max(float(rate.sum()), 1e-12))
-    alone = at_least(int(alike[unique].sum()), often * float(rate[unique].sum()))
-    return Shown(*parts, alone, int((itself & (telling > 0.0)).sum()), often * float(rate @ telling))
+    told, part = itself & (telling > 0.0), _part(pixel, camera, VERDICT.parts)
+    together = np.bincount(part, often * rate * telling, VERDICT.parts**2)
+    some = together >= VERDICT.expected
+    count = int(told[~some[part]].sum()), int(told[some[part]].sum())
+    return Shown(*parts, count, (float(together[~some].sum()), float(together[some].sum())))
 
 
 def _counted(

@@ -24,7 +24,7 @@ _FORMS = {
     **dict.fromkeys(("point", "line"), form("iu", None)),
     "covariance": form("f", None, None), "size": form("iu", 2), "pixel": form("f", None, 2),
     "segment": form("f", None, 4), "seconds": form("f"), "shared_error": form("f"),
-    "feature_seconds": form("f"),
+    "feature_seconds": form("f"), "probability": form("f"),
 }  # fmt: skip
 
 
@@ -55,6 +55,8 @@ class PlacedImage:
     shared_error: float = 0.0
     #: Seconds of finding features.
     feature_seconds: float = 0.0
+    #: That the place is right.
+    probability: float = 0.0
 
     @property
     def is_whole(self) -> bool:
@@ -74,7 +76,7 @@ class PlacedImage:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry of ``localized.json``."""
-        entry: dict[str, Any] = {"status": self.status}
+        entry: dict[str, Any] = {"status": self.status, "probability": self.probability}
         entry |= dict.fromkeys(("qvec", "tvec", "center", "center_sigma", "rotation_sigma_deg"))
         if len(self.pose):
             rotation = quaternion.to_matrix(self.pose[None, :4])[0]
@@ -118,6 +120,7 @@ def placed(name: str, found: LocalizedImage) -> PlacedImage:
         found.seconds,
         pose.matches.shared_error,
         found.feature_seconds,
+        pose.probability,
     )
 
 
@@ -139,7 +142,7 @@ def read_placed(path: Path, digest: str) -> PlacedImage | None:
             values: dict[str, Any] = {name: members.read(name, check) for name, check in _FORMS.items()}
             for name in ("name", "status", "sentence", "model"):
                 values[name] = str(values[name])
-            for name in ("seconds", "shared_error", "feature_seconds"):
+            for name in ("seconds", "shared_error", "feature_seconds", "probability"):
                 values[name] = float(values[name])
             found = PlacedImage(**values)
             if found.model:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -22,20 +21,18 @@ from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import max_errors, propose, straightened
 from groma.localization.pose.lens import lens_step
 from groma.localization.pose.matches import Matches
-from groma.localization.pose.pieces import cells_elsewhere
+from groma.localization.pose.places import Place, weighed
 from groma.localization.pose.refinement import Refined, cells_of, fitted_at, refine
 from groma.localization.pose.verdict import (
     Evidence,
+    Instead,
     Shown,
     Status,
     Verdict,
-    doubted_if_in_pieces,
     doubted_if_mirrored,
     doubted_if_missing,
     doubted_if_other_lens,
-    doubted_if_repeated,
     evidence_of,
-    fits_as_well,
     judge,
     median_distance,
     most_votes,
@@ -80,15 +77,6 @@ class MirrorQuestions:
     matches: Callable[[int], Matches]
     #: Of the most alike matches with a pose of the photograph, and with one of its mirror image: how many are of each.
     closest: Callable[[Refined, Matches, Refined], tuple[int, int]]
-
-
-class _Place(NamedTuple):
-    """A pose: fitted to all that is near, and at that pose fitted to what was matched without it."""
-
-    best: Refined
-    used: Matches
-    own: Refined
-    evidence: Evidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,52 +225,44 @@ def pose_from_matches(
         return _failed(camera, matches)
     first = evidence_of(best, matches, places)
 
-    def near(start: Refined) -> _Place:
+    def near(start: Refined) -> Place:
         assert guided is not None
         used, lens = guided(start), options.lens_of(camera)
         errors = _errors(used, options)
         whole = refine(start.camera, used, start.pose, errors, lens, gathered=True)
         own = fitted_at(best.one.at(whole.pose, whole.camera.params), whole.camera, matches, errors, lens)
-        return _Place(whole, used, own, evidence_of(own, matches, places))
+        return seen(whole, used, own, evidence_of(own, matches, places))
 
-    here = near(best) if guided is not None and first.significant else _Place(best, matches, best, first)
+    def seen(whole: Refined, used: Matches, own: Refined, evidence: Evidence) -> Place:
+        if expected is None or not evidence.significant or evidence.agree < enough:
+            return Place(whole, used, own, evidence)
+        return Place(whole, used, own, evidence, expected(whole, used))
+
+    here = near(best) if guided is not None and first.significant else seen(best, matches, best, first)
     if here.evidence.agree < enough:
         return _failed(camera, matches)
     other = _rival(matches, best, options, places, first) if options.look_for_rival and first.significant else None
-    rival = None if other is None else other[1]
-    if guided is not None and expected is not None and other is not None and fits_as_well(here.evidence, rival):
-        there = near(other[0])
-        one, two = (expected(place.best, place.used) for place in (here, there))
-        rival = None if one.is_known_beside(two) or two.is_known_beside(one) else rival
-        if two.is_known_beside(one):
-            here, other = there, (best, first)
-    return _judged(here, matches, options, (other, rival), mirror, expected, common)
+    here, there, others = weighed(here, other, near if guided else None, matches, expected is not None)
+    return _judged(here, others, None if there is None else there.best.pose, matches, options, mirror, common)
 
 
 def _judged(
-    here: _Place,
+    here: Place,
+    others: list[Instead],
+    rival: FloatArray | None,
     matches: Matches,
     options: PoseOptions,
-    other: tuple[tuple[Refined, Evidence] | None, Evidence | None],
     mirror: MirrorQuestions | None,
-    expected: Callable[[Refined, Matches], Shown] | None,
     common: Callable[[Refined, Matches], FloatArray] | None,
 ) -> AbsolutePose:
-    """A pose and what is said of it; of another place, as evidence what is not decided already."""
-    best, used, first = here.best, here.used, here.evidence
+    """A pose and what is said of it."""
+    best, used = here.best, here.used
     covariance = best.covariance(used)
     if common is not None and np.isfinite(covariance).all():
         covariance = covariance + common(best, used)
-    verdict = judge(best, covariance, median_distance(best.pose, _seen(used, best)), first, other[1])
-    supported = verdict.status == "localized"
-    shown = expected(best, used) if expected is not None and supported else Shown(0.0, 0.0)
-    if supported:
-        there = used.points2d[best.point_inliers & shown.known]
-        elsewhere = cells_elsewhere(here.own, matches, VERDICT.distinct * max_errors(matches)[0], there)
-        verdict = doubted_if_in_pieces(verdict, first.agree, elsewhere)
-        supported = verdict.status == "localized" or elsewhere > first.agree
+    verdict = judge(best, covariance, median_distance(best.pose, _seen(used, best)), here.evidence, others)
     if verdict.status == "localized":
-        verdict = doubted_if_repeated(doubted_if_missing(verdict, shown.parts, shown.missing), shown)
+        verdict = doubted_if_missing(verdict, here.shown.parts, here.shown.missing)
     if mirror is not None and verdict.status == "localized":
         verdict = _unless_mirrored(verdict, here, mirror, matches, options)
     if not options.refine_lens and verdict.status == "localized":
@@ -299,13 +279,13 @@ def _judged(
         best.camera,
         used,
         best.sigma0,
-        None if other[0] is None or verdict.status != "uncertain" else other[0][0].pose,
-        supported and verdict.status != "localized",
+        rival if verdict.status == "uncertain" else None,
+        verdict.contradicted,
     )
 
 
 def _unless_mirrored(
-    verdict: Verdict, here: _Place, mirror: MirrorQuestions, matches: Matches, options: PoseOptions
+    verdict: Verdict, here: Place, mirror: MirrorQuestions, matches: Matches, options: PoseOptions
 ) -> Verdict:
     """Return a verdict, or another one where the mirror image of a photograph fits about as well, and by matches that
     are more alike.

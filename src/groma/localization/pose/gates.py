@@ -49,13 +49,14 @@ class VerdictGates:
     parts: int = gate(8, "parts", "per longer side: each shows what is expected there", "chosen on the filing cabinet")
     expected: float = gate(3.0, "points", "expected in a part that counts", "derived from Poisson: none once in twenty")
     whole: float = gate(0.99, "probability", "that more of it is there than is missing", "chosen on the filing cabinet")
-    alone: float = gate(
-        0.25, "share", "of how often all points are found, that unique ones are found at least",
-        "chosen on rendered facades: what is found in another place that looks like this one",
+    elsewhere: tuple[float, float] = gate(
+        (0.5, 0.2), "share",
+        "of how often all points are found, that telling ones are in another place: alone, and beside others",
+        "chosen on five rendered facades: right and wrong places are told with most probability",
     )  # fmt: skip
-    known: float = gate(
-        0.6, "share", "of the same, of telling ones, where they decide for a place",
-        "chosen on five rendered facades: up to 0.53 in other places",
+    scatter: float = gate(
+        0.17, "share", "standard deviation of this from photograph to photograph, of its mean",
+        "chosen on five rendered facades: as above",
     )  # fmt: skip
     focal: float = gate(0.01, "share", "of the focal length: a step that tells another lens", "convention: a hundredth")
     shift: float = gate(

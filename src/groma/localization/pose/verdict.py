@@ -14,13 +14,23 @@ reach of a search.
 
 **Another place.** Matches that disagree are searched for a second pose. Where one is found that chance does not
 explain, :math:`k_1` cells speak for the first and :math:`k_2` for the second. If both were equally good, each would
-fall to either with the same probability; the first is the right one with the probability that the sign test says.
+fall to either with the same probability; the odds of the second are what the sign test says.
+
+**A place that the map does not have.** Where things repeat, another place may look like this one: the odds are the
+share of what agrees that the map has elsewhere, too. What tells are points that look like no other place of the map
+(:mod:`groma.localization.repeated`). Of :math:`E` that are expected :math:`k` are found, at the place itself at the
+rate of all others, elsewhere at a share :math:`s` of it. Where several stand beside each other they are a thing that
+only this place has, and :math:`s` is small; one alone may be of a thing that repeats. Rates scatter from photograph to
+photograph as gamma variables of shape :math:`a` do, so that counts are negative binomial, and the odds are divided by
+
+.. math:: \prod s^{-k} \left(\frac{a + sE}{a + E}\right)^{a + k} .
+
+By the same number a second pose is weighed against the first. A pose is believed if it is right with high probability
+beside all of these.
 
 **The rest of the image.** What is to be seen under the pose is counted part by part of the image, by how often the map
 finds it again in its own images (:mod:`groma.localization.expected`). Where about as much is missing as is there, by
-the same test, a piece of the place is shown, or something that is like it. So it is with points that are told from all
-other places of the map: where what repeats is found and they are not, another place that looks like this one is shown.
-Where they are found, this place is shown, though others fit as well, and parts that are there would fit elsewhere, too.
+the same test, a piece of the place is shown, or something that is like it.
 
 Reference: L. Moisan, B. Stival, *A probabilistic criterion to detect rigid point matches between two images and
 estimate the fundamental matrix*, 2004, eq. (9), for samples of three.
@@ -29,6 +39,7 @@ estimate the fundamental matrix*, 2004, eq. (9), for samples of three.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -36,7 +47,7 @@ import numpy as np
 
 from groma._counted import counted
 from groma._typing import BoolArray, FloatArray
-from groma.gates import NORMAL, chi_square_gate
+from groma.gates import chi_square_gate
 from groma.geometry import se3
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.gates import VERDICT
@@ -71,45 +82,43 @@ class Verdict:
     #: That the place is right.
     probability: float
     sentence: str
+    #: Whether something speaks against the pose that more matches would hardly change.
+    contradicted: bool = False
+
+    def doubted(self, why: str, probability: float = 0.5) -> Verdict:
+        """The same of a pose that something else speaks against: by itself right with this probability, or even."""
+        return Verdict("uncertain", self.probability * probability, f"{self.sentence} But {why}", True)
+
+
+class Instead(NamedTuple):
+    """What a photograph may show instead of the place of a pose."""
+
+    #: Odds beside the place itself.
+    odds: float
+    #: Why that is, in words; and whether more matches would hardly change it.
+    words: str
+    contradicts: bool = False
 
 
 class Shown(NamedTuple):
     """How much of what a pose says is in an image is there."""
 
     #: Parts of the image that show something of it, and that show nothing.
-    parts: float
-    missing: float
-    #: How often points that look like no other place are found at least, as a share of how often all are; NaN where the
-    #: place has no such points.
-    alone: float = math.nan
-    #: How many points that tell the place from others are found, and how many are expected.
-    found: int = 0
-    expected: float = 0.0
+    parts: float = 0.0
+    missing: float = 0.0
+    #: How many points that tell the place from others are found, and how many are expected: where they stand alone, and
+    #: where others are beside them.
+    found: tuple[int, int] = (0, 0)
+    expected: tuple[float, float] = (0.0, 0.0)
 
     @property
-    def known(self) -> bool:
-        """Whether what only this place has is surely there."""
-        return at_least(self.found, self.expected) >= VERDICT.known
-
-    def is_known_beside(self, other: Shown) -> bool:
-        """Whether what only this place has is surely there, and more often than what only another has is."""
-        from scipy.special import bdtrc
-
-        share = self.expected / max(self.expected + other.expected, 1e-12)
-        chance = bdtrc(self.found - 1, self.found + other.found, share) if self.found else 1.0
-        return self.known and chance <= NORMAL.false_alarm
-
-
-def at_least(found: int, expected: float) -> float:
-    """How much of what is expected is there at least; NaN where that is hardly anything.
-
-    It is the lower limit of the mean of a Poisson variable, at ``NORMAL.false_alarm`` (Garwood 1936).
-    """
-    from scipy.special import gammaincinv
-
-    if expected < VERDICT.expected:
-        return math.nan
-    return float(gammaincinv(found, NORMAL.false_alarm)) / expected if found else 0.0
+    def log_odds(self) -> float:
+        """Logarithm of how much likelier so many of these are found at the place than at another that looks like it."""
+        shape, total = VERDICT.scatter**-2, 0.0
+        for found, expected, elsewhere in zip(self.found, self.expected, VERDICT.elsewhere, strict=True):
+            rate = math.log((shape + elsewhere * expected) / (shape + expected))
+            total += (shape + found) * rate - found * math.log(elsewhere)
+        return total
 
 
 def evidence_of(refined: Refined, matches: Matches, places: int = 1) -> Evidence:
@@ -133,7 +142,7 @@ def evidence_of(refined: Refined, matches: Matches, places: int = 1) -> Evidence
 
 
 def judge(
-    refined: Refined, covariance: FloatArray, distance: float, first: Evidence, second: Evidence | None
+    refined: Refined, covariance: FloatArray, distance: float, evidence: Evidence, others: Sequence[Instead]
 ) -> Verdict:
     """Say whether a pose is right.
 
@@ -143,32 +152,26 @@ def judge(
         The pose.
     distance
         Median distance of the landmarks that agree.
-    first, second
-        Evidence for it, and for another place.
+    evidence
+        What agrees with it.
+    others
+        What may be shown instead.
     """
-    chance = 1.0 / (1.0 + math.exp(min(first.log_alarms, 700.0)))
-    rival = _as_good(first, second)
-    probability = chance * (1.0 - rival)
+    chance = math.exp(min(evidence.log_alarms, 700.0))
+    probability = 1.0 / ((1.0 + chance) * (1.0 + sum(other.odds for other in others)))
     agree = f"{counted(int(refined.point_inliers.sum()), 'points')} and " + counted(
         int(refined.line_inliers.sum()), "lines"
     )
-    if chance < NORMAL.majority:
+    if chance > 1.0:
         return Verdict(
             "failed", probability, f"No pose: only {agree} agree with the best one, as may happen by chance."
         )
-    if second is not None and fits_as_well(first, second):
-        return Verdict(
-            "uncertain",
-            probability,
-            f"Two places fit about equally well: {first.agree} measurements speak for this one, {second.agree} for "
-            "another. They may look alike.",
-        )
     if probability < VERDICT.right:
-        return Verdict(
-            "uncertain",
-            probability,
-            f"{agree} agree, which may happen by chance once in {1 / max(1 - chance, 1e-9):.0f}.",
+        by_chance = Instead(
+            chance, f"{agree} agree, which may happen by chance once in {1 / max(chance, 1e-9) + 1:.0f}."
         )
+        most = max((by_chance, *others), key=lambda other: other.odds)
+        return Verdict("uncertain", probability, most.words, most.contradicts)
     sigma = np.sqrt(np.diag(covariance))
     if not (
         np.isfinite(sigma).all() and sigma[3:].max() <= VERDICT.loose and sigma[:3].max() <= VERDICT.loose * distance
@@ -177,9 +180,40 @@ def judge(
     return Verdict("localized", probability, f"{agree} agree.")
 
 
-def fits_as_well(first: Evidence, second: Evidence | None) -> bool:
-    """Whether another place fits about as well."""
-    return _as_good(first, second) > 1.0 - VERDICT.right
+def second_place(first: Evidence, second: Evidence, odds: float) -> Instead:
+    """Return that another place of the map, which something agrees with as well, is shown."""
+    words = (
+        f"Two places fit about equally well: {first.agree} measurements speak for this one, {second.agree} for "
+        "another. They may look alike."
+    )
+    return Instead(odds, words)
+
+
+def pieces_of_others(agree: int, elsewhere: int) -> Instead:
+    """Return that a photograph is put together of pieces, some of which show the map elsewhere."""
+    words = (
+        f"{agree} measurements speak for this place, and {elsewhere} cells of the image show the map where this place "
+        "does not have it: it may repeat itself, or be put together of pieces."
+    )
+    return Instead(float(_tail(elsewhere, agree)) if elsewhere else 0.0, words, elsewhere > agree)
+
+
+def place_not_in_map(agree: int, again: int, shown: Shown) -> Instead:
+    """Return that a place is shown which the map does not have; of the cells that agree it has so many ``again``."""
+    odds = min(again / max(agree, 1), 1.0) + 0.5 * (
+        1.0 - VERDICT.right
+    )  # where nothing repeats, half of what is allowed
+    words = (
+        f"{agree} measurements agree, of which the map has {min(again, agree)} elsewhere, too, and of points that look "
+        f"like no other place {sum(shown.found)} are found where {sum(shown.expected):.0f} are expected: it may be "
+        "another place that looks like this one."
+    )
+    return Instead(odds * math.exp(-min(max(shown.log_odds, -600.0), 600.0)), words, True)
+
+
+def as_good(first: Evidence, second: Evidence) -> float:
+    """Probability that a second pose gets so few votes of both if both are equally good."""
+    return float(_tail(second.agree, first.agree))
 
 
 def doubted_if_mirrored(verdict: Verdict, own: int, mirror: int) -> Verdict:
@@ -188,22 +222,10 @@ def doubted_if_mirrored(verdict: Verdict, own: int, mirror: int) -> Verdict:
     """
     if mirror <= own:
         return verdict
-    words = (
-        f"{verdict.sentence} But its mirror image fits about as well, and {mirror} of its matches are as alike as "
-        f"{own} of the photograph: it may be mirrored."
+    return verdict.doubted(
+        f"its mirror image fits about as well, and {mirror} of its matches are as alike as {own} of the photograph: it "
+        "may be mirrored."
     )
-    return Verdict("uncertain", 1.0 - VERDICT.right, words)
-
-
-def doubted_if_in_pieces(verdict: Verdict, agree: int, elsewhere: int) -> Verdict:
-    """Return a verdict, or ``uncertain`` where about as much of the photograph shows the map elsewhere."""
-    if not elsewhere or _tail(elsewhere, agree) <= 1.0 - VERDICT.right:
-        return verdict
-    words = (
-        f"{agree} measurements speak for this place, and {elsewhere} cells of the image show the map where this place "
-        "does not have it: it may repeat itself, or be put together of pieces."
-    )
-    return Verdict("uncertain", 1.0 - VERDICT.right, words)
 
 
 def doubted_if_missing(verdict: Verdict, shown: float, missing: float) -> Verdict:
@@ -215,27 +237,14 @@ def doubted_if_missing(verdict: Verdict, shown: float, missing: float) -> Verdic
 
     chance = 1.0 - VERDICT.whole
     few = shown > missing and 0.5 ** (shown + missing - 1.0) > chance  # so few that no test could say so much
-    if missing < 1.0 or few or (shown > 0.0 and 2.0 * betainc(shown, missing + 1.0, 0.5) <= chance):
+    no_more = min(2.0 * float(betainc(shown, missing + 1.0, 0.5)), 1.0) if shown > 0.0 else 1.0
+    if missing < 1.0 or few or no_more <= chance:
         return verdict
-    words = (
-        f"{verdict.sentence} But in {missing:.0f} of {shown + missing:.0f} parts of the image where this place has "
-        "points or lines none is seen: the photograph may show this place in a part only, or something like it."
+    return verdict.doubted(
+        f"in {missing:.0f} of {shown + missing:.0f} parts of the image where this place has points or lines none is "
+        "seen: the photograph may show this place in a part only, or something like it.",
+        1.0 / (1.0 + no_more),
     )
-    return Verdict("uncertain", 1.0 - VERDICT.right, words)
-
-
-def doubted_if_repeated(verdict: Verdict, shown: Shown) -> Verdict:
-    """Return a verdict, or ``uncertain`` where what only this place has is not surely found.
-
-    That is where points that look like no other may be missing, and those that tell it from others are too few.
-    """
-    if verdict.status != "localized" or shown.known or not shown.alone < VERDICT.alone:
-        return verdict
-    words = (
-        f"{verdict.sentence} But points that look like no other place may be found only {100 * shown.alone:.0f} % as "
-        "often as all: the photograph may show another place that looks like this one."
-    )
-    return Verdict("uncertain", 1.0 - VERDICT.right, words)
 
 
 def doubted_if_other_lens(verdict: Verdict, step: LensStep) -> Verdict:
@@ -244,21 +253,17 @@ def doubted_if_other_lens(verdict: Verdict, step: LensStep) -> Verdict:
     """
     from scipy.special import chdtrc
 
-    if verdict.status != "localized":
-        return verdict
     if step.shift > VERDICT.shift and chdtrc(3.0, step.square) < 1.0 - VERDICT.whole:  # derived from three
-        why = (
-            "a principal point far from where it should be better: the photograph may be cropped, or put together of "
-            "pieces."
+        return verdict.doubted(
+            "they fit a principal point far from where it should be better: the photograph may be cropped, or put "
+            "together of pieces."
         )
-    elif abs(step.focal) > max(VERDICT.focal, math.sqrt(chi_square_gate(1.0 - VERDICT.right, 1)) * step.focal_sigma):
-        why = (
-            f"a {'longer' if step.focal > 0.0 else 'shorter'} focal length better: the calibration is not that of this "
-            "photograph. Pass its own, or let it be estimated (--calibration unknown)."
+    if abs(step.focal) > max(VERDICT.focal, math.sqrt(chi_square_gate(1.0 - VERDICT.right, 1)) * step.focal_sigma):
+        return verdict.doubted(
+            f"they fit a {'longer' if step.focal > 0.0 else 'shorter'} focal length better: the calibration is not "
+            "that of this photograph. Pass its own, or let it be estimated (--calibration unknown)."
         )
-    else:
-        return verdict
-    return Verdict("uncertain", 1.0 - VERDICT.right, f"{verdict.sentence} But they fit {why}")
+    return verdict
 
 
 def votes_of_a_rival(agree: int) -> int:
@@ -330,13 +335,6 @@ def _mean_logarithm(chance: FloatArray, points: int) -> FloatArray:
         if len(chance[part]):
             mean[part] = math.log(max(float(chance[part].mean()), 1e-12))
     return mean
-
-
-def _as_good(first: Evidence, second: Evidence | None) -> float:
-    """Probability that a second pose gets so few votes of both if both are equally good."""
-    if second is None or not second.significant:
-        return 0.0
-    return float(_tail(np.array(second.agree), first.agree))
 
 
 def _tail(fewer, more):
