@@ -224,6 +224,14 @@ def test_convert(scenes, here, name, capsys):
     assert numbers["num_points"] == read_scene(here / name).num_points
 
 
+def test_what_a_file_of_cameras_and_points_has_no_place_for_is_said(scenes, here, capsys):
+    lines = read_scene(scenes / "start.npz").num_lines
+    assert run(["convert", str(scenes / "start.npz"), "transforms.json"]) == 0
+    assert f"poses and points; it has no place for {lines} lines and 1 plane." in capsys.readouterr().err
+    assert run(["convert", str(scenes / "points.npz"), "other.json"]) == 0
+    assert "no place" not in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("name", "cameras"),
     [

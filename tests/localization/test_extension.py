@@ -297,7 +297,9 @@ def test_the_command_joins_maps_and_keeps_lines(place, truth, tmp_path):
     assert run([*map(str, given), "--quiet"]) == 0
     out = read_scene(tmp_path / "out" / "scene.npz")
     assert sorted(out.images.names) == FRAMES
-    assert json.loads((tmp_path / "out" / "summary.json").read_text())["num_kept_lines"] == 1
+    numbers = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert numbers["num_kept_lines"] == 1
+    assert numbers["diagnosis"] is not None and numbers["pose_uncertainty"]["center"]["undetermined"] == 0
     kept = out.line_observations.line_idx == out.num_lines - 1
     np.testing.assert_allclose(out.line_observations.segment[kept], segments[images])
     assert np.abs(out.lines.segments[-1] - ends).max() < 0.2

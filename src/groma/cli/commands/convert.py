@@ -69,15 +69,25 @@ def _convert(source: Path, target: Path, console: Console, force: bool) -> dict[
         from groma.io.convert import convert as convert_scene
 
         scene = convert_scene(source, target, force)
-    if target.suffix.lower() == ".json":  # cameras, poses and points
+    lost = []
+    if target.suffix.lower() == ".json":
+        lost = _beside_points(scene, target)
         scene = scene.points_only().keep(point_observations=[])
     kinds = _KINDS.get(target.suffix.lower(), ())
     console.wrote(f"{target}: {sentence_of(scene, *kinds)}")
     warnings = [*_missing_images(source, scene), *_unknown_sizes(scene, target), *_unseen_points(source, scene, target)]
-    warnings = [] if kinds else warnings
+    warnings = [] if kinds else [*lost, *warnings]
     for sentence in warnings:
         console.warn(sentence)
     return {**counts_of(scene), "warnings": warnings}
+
+
+def _beside_points(scene: "Scene", target: Path) -> list[str]:
+    """Warn of landmarks that a file of cameras, poses and points has no place for."""
+    from groma._counted import counted
+
+    left = [counted(n, kind) for n, kind in ((scene.num_lines, "lines"), (scene.num_planes, "planes")) if n]
+    return [f"{target} holds cameras, poses and points; it has no place for {' and '.join(left)}."] if left else []
 
 
 def _missing_images(source: Path, scene: "Scene") -> list[str]:

@@ -26,6 +26,9 @@ def merge(
         _options.PLAIN.option("Folder of the photographs of B, if unknown.", "--images-b", metavar="FOLDER"),
     ] = None,
     scale: Annotated[bool, _options.PLAIN.option("Estimate the scale of B, or assume that of A.")] = True,
+    diagnosis: Annotated[
+        bool | None, _options.PLAIN.option("Report what the data do not determine. Default: up to 300 images.")
+    ] = None,
     force: _options.Force = False,
     seed: _options.Seed = 0,
 ) -> None:
@@ -41,6 +44,7 @@ def merge(
     _output.check_outputs(force, output, json_target=console.json_target)
     check_inputs(first, second, first_images, second_images)
 
+    from groma.cli.shared.diagnosis import try_diagnosis
     from groma.cli.shared.extending import merge_maps
     from groma.cli.shared.mapping import run_map, say_map, stages_of_map, write_map
     from groma.localization.extension import in_world_of
@@ -56,7 +60,8 @@ def merge(
     anew = result.scene.num_lines
     result = replace(result, **{name: merged.with_lines(getattr(result, name)) for name in ("scene", "before")})
     kept = result.scene.num_lines - anew
-    numbers = {**result.summary(), "merged": merged.sentence(), "num_kept_lines": kept}
+    found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
+    numbers = {**result.summary(found), "merged": merged.sentence(), "num_kept_lines": kept}
     title = f"Map of {_output.subject(first)} and {_output.subject(second)}"
     write_map(console, result, output, work, force, images=merged.folder, title=title, summary=numbers)
     say_map(console, result, numbers, explain=False)
