@@ -3,6 +3,7 @@
 
 import inspect
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from _comparison import equal
 from groma.cli.commands.map import map_
 from groma.features.segments import SEGMENTS
 from groma.mapping.groups import distinct_pairs, num_distinct
+from groma.mapping.lines.hypotheses.known_points import lines_through_points
 from groma.mapping.lines.line_map import LineMap, explain
 from groma.mapping.lines.linking import merge as _line_merge
 from groma.mapping.lines.linking.fit import find_on_lines, near_together
@@ -111,6 +113,29 @@ def test_segments_on_lines_are_those_of_all_pairs(size, count):
     assert [tuple(pair) for pair in found[:needed].tolist()] == sorted(expected)
     np.testing.assert_allclose(squared[:needed], [expected[pair] for pair in sorted(expected)], rtol=1e-7, atol=1e-9)
     assert needed >= count // 10
+
+
+@pytest.mark.kernels
+def test_lines_through_points_are_those_of_the_first_points_on_each_segment():
+    rng = np.random.default_rng(2)
+    pixels, depths = rng.uniform(0, 200, (2000, 2)), rng.choice([0.2, 0.201, 0.5], 2000)
+    ends = np.concatenate([rng.uniform(0, 200, (30, 4)), [[50, 10, 50, 190], [10, 80, 190, 80], [20, 20, 25, 20]]])
+    along = (ends[:, 2:] - ends[:, :2]) / np.linalg.norm(ends[:, 2:] - ends[:, :2], axis=1)[:, None]
+    normal = np.column_stack([along[:, 1], -along[:, 0]])
+    views = SimpleNamespace(
+        ends=ends, line=np.column_stack([normal, -(normal * ends[:, :2]).sum(axis=1)]), usable=np.ones(33, bool),
+        range=np.tile([0.01, 1.0], (33, 1)),
+    )  # fmt: skip
+    ratios = np.tile([1.0, 0.1], (33, 1))
+    found, values = lines_through_points(views, slice(0, 33), ratios, (pixels, depths), 7)
+    for s in range(33):
+        t = (pixels - ends[s, :2]) @ along[s]
+        inside = (t >= -SEGMENTS.on) & (t <= np.linalg.norm(ends[s, 2:] - ends[s, :2]) + SEGMENTS.on)
+        first = np.flatnonzero(inside & (np.abs((pixels - ends[s, :2]) @ normal[s]) <= SEGMENTS.on))[:16]
+        alone = lines_through_points(views, slice(s, s + 1), ratios[:1], (pixels[first], depths[first]), 7)
+        np.testing.assert_array_equal(found[found[:, 0] == s, 1:], alone[0][:, 1:])
+        np.testing.assert_array_equal(values[found[:, 0] == s], alone[1])
+    assert len(np.unique(found[:, 0])) >= 25
 
 
 @pytest.mark.kernels

@@ -24,19 +24,25 @@ _MAX_POINTS = 16
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
 @kernel
-def _points_on(ends, line, pixel, inverse, max_distance, t, q):
-    """Positions along a segment and inverse depths of the points on it; return how many."""
+def _points_on(ends, line, begin, end, order, pixel, inverse, max_distance, t, q, found):
+    """Positions along a segment and inverse depths of the first points on it, of order[begin:end]; return how many."""
     ux, uy = ends[2] - ends[0], ends[3] - ends[1]
     length2 = ux * ux + uy * uy
     reach = max_distance / math.sqrt(length2)
     number = 0
-    for p in range(len(pixel)):
+    for k in range(begin, end):
+        p = order[k]
         if abs(line[0] * pixel[p, 0] + line[1] * pixel[p, 1] + line[2]) > max_distance:
             continue
         at = ((pixel[p, 0] - ends[0]) * ux + (pixel[p, 1] - ends[1]) * uy) / length2
-        if -reach <= at <= 1.0 + reach and number < len(t):
-            t[number], q[number] = at, inverse[p]
-            number += 1
+        if not -reach <= at <= 1.0 + reach or (number == len(t) and p > found[number - 1]):
+            continue
+        number = min(number + 1, len(t))
+        m = number - 1
+        while m > 0 and found[m - 1] > p:
+            t[m], q[m], found[m] = t[m - 1], q[m - 1], found[m - 1]
+            m -= 1
+        t[m], q[m], found[m] = at, inverse[p], p
     return number
 
 
@@ -95,15 +101,16 @@ def _through_several(t, q, number, tolerance, min_apart, out):
 
 @loop
 def _propose(
-    ends, line, usable, search, ratio, pixel, inverse, max_distance, tolerance, min_apart, neighbor, out_index, out,
+    ends, line, usable, search, ratio, near, order, pixel, inverse, max_distance, tolerance, min_apart, neighbor,
+    out_index, out,
 ):  # fmt: skip
     """Lines through one point have the slot ``neighbor + 1``, those through several ``neighbor``; return how many."""
     count = 0
-    t, q, work = np.empty(_MAX_POINTS), np.empty(_MAX_POINTS), np.empty(5)
+    t, q, found, work = np.empty(_MAX_POINTS), np.empty(_MAX_POINTS), np.empty(_MAX_POINTS, np.int64), np.empty(5)
     for i in range(len(ends)):
         if not usable[i]:
             continue
-        number = _points_on(ends[i], line[i], pixel, inverse, max_distance, t, q)
+        number = _points_on(ends[i], line[i], near[i, 0], near[i, 1], order, pixel, inverse, max_distance, t, q, found)
         for several in range(2):
             if several:
                 if not _through_several(t, q, number, tolerance, min_apart, work):
@@ -146,8 +153,11 @@ def lines_through_points(
         :class:`groma.mapping.lines.hypotheses.proposals.Proposals`.
     """
     index, values = np.empty((2 * len(ratios), 3), np.int64), np.empty((2 * len(ratios), 6))
+    ends, order = views.ends[rows], np.argsort(points[0][:, 0])
+    x = np.sort(ends[:, ::2], axis=1) + 2.0 * SEGMENTS.on * np.array([-1.0, 1.0])  # a point on a segment is in between
+    near = np.searchsorted(points[0][order, 0], x)
     count = _propose(
-        views.ends[rows], views.line[rows], views.usable[rows], views.range[rows], ratios, *points, SEGMENTS.on,
+        ends, views.line[rows], views.usable[rows], views.range[rows], ratios, near, order, *points, SEGMENTS.on,
         AGREEMENT.depth, SEGMENTS.overlap, slot, index, values,
     )  # fmt: skip
     return index[:count], values[:count]
