@@ -3,6 +3,7 @@
 
     python benchmarks/track_draws.py SEQUENCE [SEQUENCE ...] [--draws 4] [--kind KIND]
     python benchmarks/track_draws.py SEQUENCE [SEQUENCE ...] --drop 6 20 [--every 5] [--within 3] [--at 14]
+    python benchmarks/track_draws.py SEQUENCE [SEQUENCE ...] --stride 3 4 5 [--draws 2]
 
 SEQUENCE is one with a reference. The tracker runs without threads, so CPU times are those of the work itself.
 
@@ -13,6 +14,9 @@ With --drop, the process forks (Linux, macOS) at every n-th frame that was track
 the copy goes on after so many frames, with their time stamps. Its first frame in the earlier map, within some frames
 after the gap, is right if its motion since the frame before the gap is that of the reference to 10 cm or 10 % of the
 way, and 10 degrees. Otherwise it is not found.
+
+With --stride, every n-th frame is tracked, from the first, second, ... one (all n, or as many as --draws). A frame is
+right if its motion from a frame of its map is right in the same sense: from that one for which most are.
 """
 
 import argparse
@@ -82,6 +86,43 @@ def found_again(tracker: Tracker, frames: list, poses, last: int, pose, gap: int
     return NOT_FOUND
 
 
+def judged(camera, frames: list, poses) -> tuple[int, int, int]:
+    """Track frames; return how many were right, wrong, or had no pose when they were answered."""
+    tracker = Tracker(camera, TrackOptions(threaded=False))
+    maps: dict[int, list] = {}
+    for frame, reference in zip(frames, poses, strict=True):
+        tracked = tracker.process(frame)
+        if tracked.pose is not None:
+            maps.setdefault(tracked.submap, []).append((tracked.pose, reference))
+    right = sum(
+        max(sum(is_right(pose, other, reference, of_other) for pose, reference in own) for other, of_other in own)
+        for own in maps.values()
+    )
+    posed = sum(map(len, maps.values()))
+    return right, posed - right, len(frames) - posed
+
+
+def with_reference(path: Path, kind: str | None):
+    """Return the camera of a sequence, its frames, and the reference pose of each (n, 7), cam_from_world."""
+    sequence = open_sequence(path, kind=kind)
+    frames = list(sequence)
+    rows = [int(np.abs(sequence.reference.timestamps - frame.timestamp).argmin()) for frame in frames]
+    return sequence.camera, frames, se3.inverse(sequence.reference.world_from_cam[rows])
+
+
+def print_strides(paths: list[Path], arguments: argparse.Namespace) -> None:
+    """Print a row for each sequence and stride."""
+    print("| sequence | every | right / wrong / lost | by the first frame |")
+    print("|---|--:|---|---|")
+    for path in paths:
+        camera, frames, poses = with_reference(path, arguments.kind)
+        for stride in arguments.stride:
+            firsts = range(min(stride, arguments.draws or stride))
+            counts = [judged(camera, frames[first::stride], poses[first::stride]) for first in firsts]
+            total, *each = (" / ".join(map(str, count)) for count in [np.sum(counts, axis=0), *counts])
+            print(f"| {path.name} | {stride} | {total} | {', '.join(each)} |", flush=True)
+
+
 def in_a_copy(work) -> int:
     """Return the small number that some work gives in a copy of this process."""
     child = os.fork()
@@ -99,13 +140,9 @@ def print_drops(paths: list[Path], arguments: argparse.Namespace) -> None:
     print("| sequence | dropped | gaps | right / wrong / not found | last frames before wrong ones |")
     print("|---|--:|--:|---|---|")
     for path in paths:
-        sequence = open_sequence(path, kind=arguments.kind)
-        frames = list(sequence)
-        times = sequence.reference.timestamps
-        rows = [int(np.abs(times - frame.timestamp).argmin()) for frame in frames]
-        poses = se3.inverse(sequence.reference.world_from_cam[rows])
+        camera, frames, poses = with_reference(path, arguments.kind)
         outcomes: dict[int, list[tuple[int, int]]] = {gap: [] for gap in arguments.drop}
-        tracker = Tracker(sequence.camera, TrackOptions(threaded=False))
+        tracker = Tracker(camera, TrackOptions(threaded=False))
         for number, frame in enumerate(frames):
             tracked = tracker.process(frame)
             wanted = number in arguments.at if arguments.at else number >= 3 and number % arguments.every == 0
@@ -127,18 +164,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequences", type=Path, nargs="+", metavar="SEQUENCE")
     parser.add_argument("--kind", choices=("rgbd", "stereo", "mono"), help="what the frames hold, if not all")
-    parser.add_argument("--draws", type=int, default=4, help="tracks of each sequence")
+    parser.add_argument("--draws", type=int, help="tracks of each sequence (default: 4) or stride")
     parser.add_argument("--drop", type=int, nargs="+", help="frames dropped instead")
     parser.add_argument("--every", type=int, default=5, help="a gap after every n-th frame")
     parser.add_argument("--at", type=int, nargs="+", help="or after these frames, counted from 0")
+    parser.add_argument("--stride", type=int, nargs="+", help="every n-th frame instead")
     parser.add_argument("--within", type=int, default=3, help="frames looked at after a gap")
     arguments = parser.parse_args()
     one_opencv_thread()
     with work_with(1):
         if arguments.drop:
             print_drops(arguments.sequences, arguments)
+        elif arguments.stride:
+            print_strides(arguments.sequences, arguments)
         else:
-            print_draws(arguments.sequences, arguments.kind, arguments.draws)
+            print_draws(arguments.sequences, arguments.kind, arguments.draws or 4)
 
 
 if __name__ == "__main__":

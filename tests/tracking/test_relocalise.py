@@ -12,7 +12,7 @@ from groma.geometry import se3
 from groma.tracking.frame.camera import TrackCamera, into
 from groma.tracking.frame.descriptor_pairs import PlacedFeatures, pair_anywhere, pair_near
 from groma.tracking.gates import DEFAULT
-from groma.tracking.pose.relocalise import _Search, pose_from_matches
+from groma.tracking.pose.relocalise import PoseSearch, pose_from_matches
 
 CAMERA = TrackCamera(525.0, 525.0, 320.0, 240.0, 640, 480)
 
@@ -132,11 +132,11 @@ def test_depths_are_medians_of_what_is_known_and_alike():
 
 def _search(agreeing, scores):
     """A search in which poses, told by their x, agree with so many features, and score so much once refined."""
-    search = object.__new__(_Search)
+    search = object.__new__(PoseSearch)
     search.gates, search._best, search._tried = DEFAULT.finding, None, []
     search.track_map = SimpleNamespace(near=SimpleNamespace(depth=1.0))
     search._agreeing = lambda pose: agreeing[pose[4]]
-    search._refine = lambda pose: SimpleNamespace(score=scores[pose[4]], estimate=SimpleNamespace(pose=pose))
+    search.refine = lambda pose: SimpleNamespace(score=scores[pose[4]], estimate=SimpleNamespace(pose=pose))
     return search
 
 

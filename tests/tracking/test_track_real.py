@@ -32,6 +32,13 @@ def test_cabinet_with_frames_left_out(shared_data, stride):
     assert scores.ate.rmse < 0.03
 
 
+def test_a_cabinet_seen_again_from_the_opposite_side_is_not_found(shared_data):
+    """One keyframe, five frames in which nothing agrees, then 57 points, lines and planes of the other side."""
+    frames = open_sequence(shared_data / "rgbd_tum_fr3_cabinet")
+    tracker = Tracker(frames.camera, TrackOptions(threaded=False))
+    assert [tracker.process(frame).status for frame in list(frames)[5:36:6]] == ["tracked", *["lost"] * 5]
+
+
 @pytest.mark.parametrize("kind", ["stereo", "mono"])
 @pytest.mark.parametrize("stride", [SECOND, 3])
 def test_street_with_frames_left_out(shared_data, kind, stride):

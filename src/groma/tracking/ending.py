@@ -18,6 +18,7 @@ from groma.errors import is_interrupt
 from groma.io.trajectories import Trajectory
 from groma.solver.report import SolveReport
 from groma.tracking.backend.depth_calibration import depths_that_do_not_fit
+from groma.tracking.backend.focal_length import focal_length_that_does_not_fit
 from groma.tracking.backend.mapper import Mapper, Present
 from groma.tracking.backend.plane_outcome import PlaneOutcome
 from groma.tracking.backend.submaps import Joint, Places, Submap, best_joint
@@ -127,10 +128,16 @@ class Ending:
         report, turn = self.attempt(
             "the adjustment of all keyframes", lambda: mapper.adjust_at_end(number), (None, turn), changes=(number,)
         )
-        told = [] if mapper.depth_offset is None else mapper.depth_offset.warnings()
-        if not told and not mapper.camera.baseline > 0 and mapper.map.living():
-            gates = mapper.options.gates.depth
-            told = self.attempt("whether depths fit", lambda: depths_that_do_not_fit(mapper.map, gates), [], changes=())
+        told, gates = [] if mapper.depth_offset is None else mapper.depth_offset.warnings(), mapper.options.gates
+        if mapper.camera.baseline > 0:
+            told = self.attempt(
+                "whether the focal length fits",
+                lambda: focal_length_that_does_not_fit(mapper.map, mapper.camera, gates.rectification), [], changes=(),
+            )  # fmt: skip
+        elif not told and mapper.map.living():
+            told = self.attempt(
+                "whether depths fit", lambda: depths_that_do_not_fit(mapper.map, gates.depth), [], changes=()
+            )
         self.warnings += [one for one in told if one not in self.warnings]
         what = "the planes of the map's points and lines"
         again, planes = self.attempt(what, lambda: mapper.adjust_with_planes(number), (None, None), (number,))

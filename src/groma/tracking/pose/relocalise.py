@@ -167,7 +167,7 @@ def find_pose(
 
     What the first keyframe proposes hangs on no guess, and is worked out in a pool.
     """
-    search = _Search(track_map, camera, data, known_features(track_map, camera, keyframes), predicted, prior_sigma)
+    search = PoseSearch(track_map, camera, data, known_features(track_map, camera, keyframes), predicted, prior_sigma)
     gates = data.options.gates
     strong = gates.verification.strong
     first = beside(pool, partial(search.proposal, keyframes[0]))
@@ -187,7 +187,7 @@ def find_pose(
     return search.best_of(search.on_planes(), gates.finding.max_refined)
 
 
-class _Search:
+class PoseSearch:
     """One frame, the features it is compared with, and the best pose so far."""
 
     def __init__(self, track_map, camera, data, known, predicted, prior_sigma) -> None:
@@ -258,7 +258,7 @@ class _Search:
                     break
             if self._is_known(starts[k]):
                 continue
-            found = self._refine(starts[k])
+            found = self.refine(starts[k])
             self._tried.append(starts[k])
             if found is not None:
                 self._tried.append(found.estimate.pose)
@@ -288,7 +288,7 @@ class _Search:
         same = apart[:, :3].max(axis=1) < self.gates.same_shift * depth
         return bool((same & (apart[:, 3:].max(axis=1) < self.gates.same_turn)).any())
 
-    def _refine(self, start: FloatArray) -> Found | None:
+    def refine(self, start: FloatArray) -> Found | None:
         """Estimate the pose from all that agrees with a start, with narrowing gates."""
         track_map, camera, data, gates = self.track_map, self.camera, self.data, self.gates
         own = self.all_gates

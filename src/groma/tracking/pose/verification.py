@@ -5,7 +5,8 @@ A pose needs enough points and lines that agree with it, of enough that were loo
 the frame confirms it: what the map knows to be somewhere is then measured there. Where few agree and
 depth is known, it must; and a pose that was searched must not look through what the map knows. Where few points agree
 with it, lines must be seen where they should (:mod:`groma.tracking.pose.expected_lines`). Where nothing tells what the
-camera sees, after a loss or many missing frames, its place must stand out (:mod:`groma.tracking.pose.rivals`).
+camera sees, after a loss or many missing frames, its place must stand out (:mod:`groma.tracking.pose.rivals`), and it
+must not be left open whether it is the place or its other side (:mod:`groma.tracking.pose.half_turns`).
 """
 
 from __future__ import annotations
@@ -28,8 +29,12 @@ from groma.tracking.options import TrackOptions
 from groma.tracking.pose.depth_check import depth_agreement
 from groma.tracking.pose.estimate import PoseEstimate
 from groma.tracking.pose.expected_lines import line_odds
+from groma.tracking.pose.half_turns import poses_left_open
 from groma.tracking.pose.relocalise import Found, find_pose, match_lines, match_near
 from groma.tracking.pose.rivals import num_cells, stands_out
+
+#: Standard deviations (6,) of a prior that tells nothing: scene units, radians.
+_ANYWHERE = np.array([1e3] * 3 + [10.0] * 3)
 
 
 class PoseVerification:
@@ -138,6 +143,23 @@ class PoseVerification:
         votes = num_cells(camera, pixel[pairs[:, 1]]) + len(found.lines.index)
         return stands_out(camera, pose, votes, votes_at, gates.finding.near)
 
+    def _is_open(
+        self, track_map: TrackMap, data: FrameFeatures, found: Found, predicted: FloatArray, sigma: FloatArray
+    ) -> bool:
+        """Whether a pose on another side, which is not much less likely by the prediction, is not denied."""
+
+        def nats(pose: FloatArray) -> float:
+            shift, turn = apart(pose, predicted)
+            return 1.5 * float((shift / np.linalg.norm(sigma[:3])) ** 2 + (turn / np.linalg.norm(sigma[3:])) ** 2)
+
+        others = poses_left_open(track_map, self.camera, data, self._chosen(track_map), found, sigma)
+        return any(nats(other) < nats(found.estimate.pose) + self.gates.odds for other in others)
+
+    def _chosen(self, track_map: TrackMap) -> list[Keyframe]:
+        """Return recent keyframes and an even choice of the others, the last one first."""
+        living = track_map.living()[::-1]
+        return living[:: max(1, len(living) // self.gates.tried)][: self.gates.tried]
+
     def find(
         self,
         track_map: TrackMap,
@@ -155,14 +177,14 @@ class PoseVerification:
         """
         says_nothing = self._says_nothing(track_map, prior_sigma)
         alone = lost_for > self.gates.lost_frames or ((after_gap or lost_for > 0) and says_nothing)
-        if lost_for <= self.gates.lost_frames:
+        if lost_for > self.gates.lost_frames:
+            prior_sigma, found = _ANYWHERE, None
+        else:
             found = self.find_near(track_map, data, guesses, predicted, prior_sigma, alone, pool)
-            if found is not None:
-                return found
-        found = self.find_anywhere(track_map, data, alone)
-        if found is None or lost_for > self.gates.lost_frames:
-            return found
-        return found if self.is_near(found.estimate.pose, predicted, prior_sigma) else None
+        found = found or self.find_anywhere(track_map, data, alone)
+        if found is None or not self.is_near(found.estimate.pose, predicted, prior_sigma):
+            return None
+        return None if alone and self._is_open(track_map, data, found, predicted, prior_sigma) else found
 
     def find_near(
         self,
@@ -195,11 +217,9 @@ class PoseVerification:
 
     def find_anywhere(self, track_map: TrackMap, data: FrameFeatures, alone: bool = True) -> Found | None:
         """Find a frame by described features, among recent keyframes and an even choice of the others."""
-        living = track_map.living()
-        wide = np.array([1e3] * 3 + [10.0] * 3)
         best = None
-        for keyframe in living[::-1][:: max(1, len(living) // self.gates.tried)][: self.gates.tried]:
-            found = find_pose(track_map, self.camera, data, [keyframe], [], keyframe.pose, wide)
+        for keyframe in self._chosen(track_map):
+            found = find_pose(track_map, self.camera, data, [keyframe], [], keyframe.pose, _ANYWHERE)
             if found is not None and (best is None or found.score > best.score):
                 best = found
             if best is not None and best.score > self.gates.strong:

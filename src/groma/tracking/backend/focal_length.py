@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""A focal length of a stereo pair that the images contradict.
+
+With a focal length that is too long by a factor s, the depth :math:`z = f b / d` of all points is too large by s, and
+so are motions along the optical axis. Where the camera only drives ahead that is another scene, as good as the right
+one; where it turns, the images contradict. So the focal length is freed in a few steps from where the adjustment of all
+keyframes ended. What did not fit the given one was left out while tracking, so the correction that comes out is smaller
+than the error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from groma.adjustment.assemble import assemble
+from groma.gates import NORMAL
+from groma.scene import Cameras
+from groma.solver.covariance.marginals import Covariances
+from groma.solver.options import SolverOptions
+from groma.solver.solve import solve
+from groma.tracking.backend.local_adjustment import job_of
+from groma.tracking.frame.camera import TrackCamera
+from groma.tracking.gates import RectificationGates
+from groma.tracking.map.map_scene import TRACKING
+from groma.tracking.map.track_map import TrackMap
+
+#: A pinhole with one focal length, and the group of its parameters in a problem.
+_MODEL = "SIMPLE_PINHOLE"
+_GROUP = f"intrinsics/{_MODEL}"
+
+
+def focal_length_that_does_not_fit(track_map: TrackMap, camera: TrackCamera, gates: RectificationGates) -> list[str]:
+    """Say so where the images of a map surely ask for another focal length of their rectified pair."""
+    living = track_map.living()
+    held = np.arange(len(living)) == 0
+    options = replace(TRACKING, lines=False, planes=False, refine_intrinsics=True, held_frames=held)
+    job = job_of(track_map, camera, living, held, False, options=options) if len(living) > 1 else None
+    if job is None:
+        return []
+    params = camera.params[None, [0, 2, 3]]
+    one = Cameras(np.array([1]), (_MODEL,), params, np.array([camera.width]), np.array([camera.height]))
+    # Depths that features had where the map was lost are columns under the given focal length.
+    scene = job.scene.replace(cameras=one, point_depths=job.scene.point_depths.take(np.zeros(0, np.int64)))
+    if len(scene.right_columns) < gates.min_columns:
+        return []
+    settings = SolverOptions(max_iterations=gates.focal_iterations, threads=1)
+    solved = solve(assemble(scene, options).problem, settings).problem
+    change = float(solved.variables[_GROUP].state[0, 0] / camera.fx) - 1.0
+    sigma = float(Covariances(solved).of(_GROUP, 0)[0, 0, 0] ** 0.5 / camera.fx)
+    if not abs(change) > max(gates.focal_share, NORMAL.sure * sigma):
+        return []
+    which = "longer" if change > 0.0 else "shorter"
+    return [
+        f"The focal length does not fit the images: one {100.0 * abs(change):.1f} ± {100.0 * sigma:.1f} % {which} than "
+        f"{camera.fx:.1f} px fits better, and the error may be larger. Lengths along the optical axis are wrong by as "
+        "much. Check the calibration of the pair."
+    ]
