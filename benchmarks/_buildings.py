@@ -88,7 +88,7 @@ def render_building(settings: BuildingSettings) -> RenderedScene:
     """Make the building of a seed and its images."""
     rng = np.random.default_rng([settings.seed, len(settings.kind)])
     site = _Site(rng, World([], [], np.zeros((0, 2, 3)), [], []))
-    poses, focal = {"room": _room, "wings": _wings, "gable": _gable, "stairs": _stairs}[settings.kind](site)
+    poses, focal = KINDS[settings.kind](site)
     faces = site.world.polygons
     world = replace(site.world, edges=np.concatenate([np.stack([p, np.roll(p, -1, axis=0)], axis=1) for p in faces]))
     images = BoxSettings(width=640, height=480, focal=focal, num_images=len(poses), texture=settings.texture)
@@ -179,3 +179,7 @@ def _arc(rng: np.random.Generator, radii: list, target: list, number: int) -> li
         center = np.array([radii[0] * np.cos(way), 1 - radii[1] * np.sin(way), 1.5]) + rng.normal(0, 0.15, 3)
         poses.append(se3.looking_at(center, np.array(target) + rng.normal(0, 0.15, 3)))
     return poses
+
+
+#: By name: what puts up the faces of a building, and returns poses and focal length.
+KINDS = {"room": _room, "wings": _wings, "gable": _gable, "stairs": _stairs}

@@ -3,17 +3,20 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
 import numpy as np
+from _buildings import KINDS, BuildingSettings, render_building
 from _rendered_boxes import BoxSettings, render_boxes
 from _workshop import CACHE
 
 from groma.features import LsdDetector, Segments
 from groma.features.close_edges import CloseEdges
+from groma.features.contrast import WithContrast
 from groma.io import read_scene
 from groma.io.colmap.model import from_pycolmap
 from groma.scene import Scene
@@ -35,7 +38,7 @@ class LineScene:
 
     def segments(self, min_length: float) -> list[Segments]:
         """Return groma's segments of each image."""
-        detector = CloseEdges(LsdDetector(min_length=min_length))
+        detector = WithContrast(CloseEdges(LsdDetector(min_length=min_length)))
         return [detector.detect(image) for image in self.images]
 
 
@@ -43,6 +46,18 @@ def boxes(name: str, settings: BoxSettings) -> LineScene:
     """Return rendered boxes; one scene unit is taken for a metre."""
     rendered = render_boxes(settings)
     return LineScene(name, rendered.scene, rendered.images, rendered.edges, [0.001, 0.005])
+
+
+def unseen(name: str) -> LineScene:
+    """Return the textured boxes or building of a seed, such as ``stairs-3103``, at four shares of its extent."""
+    kind, seed = name.split("-")
+    if kind == "boxes":
+        rendered = render_boxes(BoxSettings(seed=int(seed), texture=10.0, width=640, height=480, focal=560.0))
+    else:
+        rendered = render_building(BuildingSettings(kind, int(seed)))
+    extent = float(np.linalg.norm(np.ptp(rendered.edges.reshape(-1, 3), axis=0)))
+    thresholds = [k * extent for k in (0.0002, 0.001, 0.005, 0.01)]
+    return LineScene(name, rendered.scene, rendered.images, rendered.edges, thresholds)
 
 
 def strecha(name: str, folder: Path) -> LineScene:
@@ -161,6 +176,8 @@ SCENES: dict[str, Callable[[Path], LineScene]] = {
     "herz-jesus": lambda data: strecha("herz-jesus", data / "strecha_herz_jesus_p8"),
     "castle": lambda data: strecha("castle", data / "strecha_castle_p30"),
 }
+#: ... and ``KIND-SEED`` for scenes that nobody has looked at.
+UNSEEN = re.compile("(" + "|".join(["boxes", *KINDS]) + r")-\d+")
 #: Shortest segment of the photographs, pixels; elsewhere that of the options of mapping.
 MIN_LENGTH = {"fountain": 20.0, "herz-jesus": 20.0, "castle": 20.0}
 #: LIMAP gets the longer ones of these only: its time grows with their square.

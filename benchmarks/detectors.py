@@ -46,9 +46,8 @@ ROOT = Path(__file__).parents[1]
 
 def joined(first: Segments, second: Segments) -> Segments:
     """The segments of both detectors, the longest first, without those that a longer one covers."""
-    parts = [np.concatenate([getattr(one, name) for one in (first, second)]) for name in ("ends", "sigma", "strength")]
-    order = np.argsort(-np.hypot(*(parts[0][:, 2:] - parts[0][:, :2]).T), kind="stable")
-    both = Segments(*(part[order] for part in parts))
+    both = Segments.joined([first, second])
+    both = both.select(np.argsort(-both.length, kind="stable"))
     return both.select(np.flatnonzero(~covered(both.ends)))
 
 

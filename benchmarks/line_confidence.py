@@ -22,7 +22,6 @@ from _line_scenes import MIN_LENGTH, SCENES, LineScene, boxes
 from _rendered_boxes import BoxSettings
 from _workshop import CACHE, ROOT
 from scipy.optimize import minimize
-from scipy.special import expit
 
 from groma.evaluation.lines import Distances, Geometry, places_on, score_lines
 from groma.io import read_archive, write_archive
@@ -31,6 +30,7 @@ from groma.mapping.lines.confidence import (
     DEFAULT_CONFIDENCE,
     GATES,
     WEIGHTS,
+    edge_probability,
     line_accuracy,
     line_evidence,
     usual_distance,
@@ -107,7 +107,7 @@ def judged(source: LineScene, cache: Path) -> Judged:
 
 def probability(one: Judged, weights: np.ndarray) -> np.ndarray:
     """Return the probability that each line is right."""
-    return expit(one.evidence @ weights) * one.accuracy
+    return edge_probability(one.evidence, weights) * one.accuracy
 
 
 def fitted(scenes: list[Judged]) -> np.ndarray:
@@ -116,13 +116,14 @@ def fitted(scenes: list[Judged]) -> np.ndarray:
     right = np.concatenate([one.right[one.counted] for one in scenes])
     accuracy = np.concatenate([one.accuracy[one.counted] for one in scenes])
     mean, spread = x.mean(0), x.std(0)
+    mean[-1] = 0.0  # an edge and texture are equally likely where the prominence says so
     rows = np.column_stack([np.ones(len(x)), (x - mean) / spread])
 
     def cost(weights: np.ndarray) -> float:
-        p = np.clip(expit(rows @ weights) * accuracy, 1e-9, 1.0 - 1e-9)
+        p = np.clip(edge_probability(rows, weights) * accuracy, 1e-9, 1.0 - 1e-9)
         return -np.log(np.where(right, p, 1.0 - p)).sum() + 0.5 * (weights[1:] ** 2).sum()
 
-    weights = minimize(cost, np.zeros(rows.shape[1]), method="L-BFGS-B").x
+    weights = minimize(cost, np.ones(rows.shape[1]), method="L-BFGS-B").x
     return np.concatenate([[weights[0] - (weights[1:] * mean / spread).sum()], weights[1:] / spread])
 
 

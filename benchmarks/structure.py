@@ -40,6 +40,7 @@ from groma.estimators._parallel_lines import ParallelGates, _anywhere, _members
 from groma.evaluation.alignment import align_poses
 from groma.features import LsdDetector
 from groma.features.close_edges import CloseEdges
+from groma.features.contrast import WithContrast
 from groma.geometry.algebra import norm, unit
 from groma.io import read_archive, write_archive
 from groma.mapping.checkpoints import Stages
@@ -103,7 +104,7 @@ def mapped(name: str, settings: BoxSettings | BuildingSettings, cache: Path) -> 
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
         options = MapOptions(refine_poses=False, threads=1)
-        detector = CloseEdges(LsdDetector(min_length=options.min_segment_length))  # cameras are held
+        detector = WithContrast(CloseEdges(LsdDetector(min_length=options.min_segment_length)))  # cameras are held
         segments = [detector.detect(image) for image in rendered.images]
         with tempfile.TemporaryDirectory() as work, Stages(Path(work), name, options) as stages:
             points = with_point_noise(stages.run(adjust_points, rendered.scene))

@@ -57,3 +57,8 @@ def test_the_picture_has_a_curve_for_each_program(lines):
     assert len(curves) == 4 and {path.get("stroke-dasharray") for path in curves} == {"", "5 4"}
     assert any(text.text == "a < b" for text in drawn.iter(f"{name}text"))
     assert len([*drawn.iter(f"{name}circle")]) == 4
+
+
+def test_scenes_are_listed_or_made_of_a_kind_and_a_seed(lines):
+    assert all(lines.UNSEEN.fullmatch(name) for name in ("stairs-3103", "boxes-1", "room-2", "wings-3", "gable-4"))
+    assert not any(lines.UNSEEN.fullmatch(name) for name in (*lines.SCENES, "stairs", "tower-3", "stairs-3-4"))

@@ -12,6 +12,7 @@ from groma.io.archive import read_archive, write_archive
 from groma.mapping.lines.confidence import (
     GATES,
     WEIGHTS,
+    edge_probability,
     line_accuracy,
     line_confidence,
     line_evidence,
@@ -62,13 +63,36 @@ def test_evidence_by_hand():
     ends = [[[0.0, -1, 10], [0, 1, 10]], [[0, -9, 10], [0, 12, 10]]]
     found = columns(scene_of(ends, [[-1.0, 0, 0], [1, 0, 0]], noise=0.0))
     np.testing.assert_allclose(np.exp(found["spread"]), np.sin(np.arctan(0.1)), rtol=1e-9)
-    np.testing.assert_allclose(np.exp(found["length"]), np.array([100.0, 1050.0]) / 575.0, rtol=1e-9)
+    # Nothing is known of their contrast: it is the usual one.
+    usual = GATES.usual_contrast / GATES.texture
+    np.testing.assert_allclose(np.exp(found["prominence"]), usual * np.array([100.0, 1050.0]) / 575.0, rtol=1e-9)
     # Both are seen by all images; the second leaves the frame, so that no image is expected to show it.
     np.testing.assert_allclose(np.exp(found["support"]), [5.0, 5.0])
     fewer = scene_of(ends, [[-1.0, 0, 0], [1, 0, 0], [0, 0, 1]], noise=0.0)
     rows = fewer.line_observations.image_idx < 2
     support = columns(fewer.keep(line_observations=rows))["support"]
     np.testing.assert_allclose(np.exp(support), [2.5 / 1.5, 5.0])
+
+
+def test_lines_that_do_not_stand_out_are_texture(scene):
+    seen, stripes = scene.line_observations, np.arange(10)
+    told = np.where(np.isin(seen.line_idx, stripes), 1.5, 20.0)
+    before = line_confidence(scene.replace(line_observations=seen.replace(contrast=np.full(len(seen), 20.0))))
+    after = line_confidence(scene.replace(line_observations=seen.replace(contrast=told)))
+    np.testing.assert_array_equal(after[10:], before[10:])
+    assert (after[stripes] < 0.6 * before[stripes]).all()
+    # Where it is known of some segments only, these tell; the mean is that of logarithms.
+    some = np.where(seen.image_idx < 4, 0.0, np.where(seen.image_idx == 4, 2.0, 8.0))
+    part = scene.replace(line_observations=seen.replace(contrast=some))
+    whole = scene.replace(line_observations=seen.replace(contrast=np.full(len(seen), 4.0)))
+    np.testing.assert_allclose(line_evidence(part), line_evidence(whole), rtol=1e-12)
+
+
+def test_an_edge_and_texture_are_equally_likely_at_the_gate():
+    weights = np.array(list(WEIGHTS.values()))
+    rows = np.array([[1.0, 0, 0, 0, 0], [1.0, 0, 0, 0, 20.0], [1.0, 0, 0, 0, -20.0]])
+    at, far, below = edge_probability(rows, weights)
+    assert at == pytest.approx(0.5 * far) and below < 1e-12
 
 
 def test_residuals_are_told_in_pixels_whatever_the_standard_deviations_say(scene):
@@ -162,8 +186,8 @@ def test_good_lines_are_more_probable_than_lines_of_unrelated_segments(scene):
     assert ranks[wrong].mean() < 7.0 and np.median(after[10:]) > 5.0 * np.median(after[wrong])
     fewer = line_confidence(scene.keep(line_observations=seen.image_idx < 3))
     assert (fewer < before).mean() > 0.9
-    signs = {name: np.sign(WEIGHTS[name]) for name in ("spread", "support", "length", "residual")}
-    assert signs == {"spread": 1, "support": 1, "length": 1, "residual": -1}
+    signs = {name: np.sign(WEIGHTS[name]) for name in ("spread", "support", "prominence", "residual")}
+    assert signs == {"spread": 1, "support": 1, "prominence": 1, "residual": -1}
 
 
 def test_kept_in_archives(scene, tmp_path):

@@ -64,8 +64,11 @@ def test_a_map_of_known_points_lies_on_the_walls(rendered, tmp_path):
     told = MapOptions(threads=1, find_planes=False)
     still = map_images(folder, tmp_path / "still", truth, told)
     found = map_images(folder, tmp_path / "rows", with_rolling_shutter(truth), told)  # the scene says it
-    assert np.median(off_walls(found.scene)) < 0.5 * np.median(off_walls(still.scene))
-    assert found.scene.num_lines > 2 * still.scene.num_lines
+    away, without = off_walls(found.scene), off_walls(still.scene)
+    assert np.median(away) < 0.5 * np.median(without)
+    # Lines of a map without motions may fit each other; on the walls they are not.
+    near = np.median(away)
+    assert len(away) > len(without) and (away <= near).sum() > 2 * (without <= near).sum()
     # Words and numbers are of one problem.
     assert all(sentence in found.explanation for sentence in found.motions().sentences())
     assert set(found.motions().warnings()) <= set(found.warnings)

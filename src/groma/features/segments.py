@@ -9,7 +9,8 @@ the two edges of a dark bar on a bright wall are distinct.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
@@ -51,17 +52,22 @@ class Segments:
     #: (N,) mean gradient across the segment, grey levels (of 255) per pixel.
     strength: FloatArray
 
+    #: (N,) that gradient over the one beside it (:mod:`groma.features.contrast`); 0, the default, where unknown.
+    contrast: FloatArray = field(default_factory=lambda: np.zeros(0))
+
     def __post_init__(self) -> None:
         ends = np.asarray(self.ends, dtype=np.float64)
         if ends.ndim != 2 or ends.shape[1] != 4:
             raise ShapeError(f"ends must have shape (N, 4): u1 v1 u2 v2; got {ends.shape}. Reshape it to (-1, 4).")
         object.__setattr__(self, "ends", ends)
-        for name in ("sigma", "strength"):
+        if not len(self.contrast):
+            object.__setattr__(self, "contrast", np.zeros(len(ends)))
+        for name in ("sigma", "strength", "contrast"):
             values = np.asarray(getattr(self, name), dtype=np.float64)
             if values.shape != (len(ends),):
                 raise ShapeError(f"{name} must have shape ({len(ends)},), one value a segment; got {values.shape}.")
             object.__setattr__(self, name, values)
-        if not (np.isfinite(ends).all() and np.isfinite(self.strength).all()):
+        if not (np.isfinite(ends).all() and np.isfinite([self.strength, self.contrast]).all()):
             raise InputError("Segments must be finite; got NaN or infinity. Select the finite rows first.")
         if not (np.isfinite(self.sigma).all() and (self.sigma > 0.0).all()):
             raise InputError("sigma must be positive and finite, in pixels. Pass 0.3 where nothing is known.")
@@ -91,7 +97,13 @@ class Segments:
 
     def select(self, rows: IntArray | BoolArray) -> Segments:
         """Segments of the given rows: indices or a mask."""
-        return Segments(self.ends[rows], self.sigma[rows], self.strength[rows])
+        return Segments(self.ends[rows], self.sigma[rows], self.strength[rows], self.contrast[rows])
+
+    @staticmethod
+    def joined(parts: Sequence[Segments]) -> Segments:
+        """Segments of several parts, one after the other."""
+        parts = [Segments.empty(), *parts]
+        return Segments(*(np.concatenate([getattr(one, item.name) for one in parts]) for item in fields(Segments)))
 
     @staticmethod
     def ranked(

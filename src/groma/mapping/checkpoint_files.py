@@ -46,15 +46,15 @@ def _read_arrays(path: Path) -> dict[str, Any]:
 
 
 def _write_segments(segments: list[Segments], path: Path) -> None:
-    arrays = {name: _concatenated([getattr(s, name) for s in segments]) for name in ("ends", "sigma", "strength")}
+    arrays = {item.name: _concatenated([getattr(s, item.name) for s in segments]) for item in fields(Segments)}
     _write_arrays(path, {"counts": np.array([len(s) for s in segments], np.int64), **arrays})
 
 
 def _read_segments(path: Path) -> list[Segments]:
     saved = _read_arrays(path)
     with reading(path, "finished stage"):
-        columns = (_parted(saved[name], saved["counts"]) for name in ("ends", "sigma", "strength"))
-        return [Segments(ends, sigma, strength) for ends, sigma, strength in zip(*columns, strict=True)]
+        columns = (_parted(saved[item.name], saved["counts"]) for item in fields(Segments))
+        return [Segments(*parts) for parts in zip(*columns, strict=True)]
 
 
 _LISTS = ("outcomes", "neighbors")

@@ -10,7 +10,7 @@ than a plane can hold are resampled to several views (:mod:`groma.mapping.wide_v
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from groma._typing import FloatArray
 from groma.errors import InputError
 from groma.execution import map_work
 from groma.features.contract import SegmentDetector
+from groma.features.contrast import contrast_of
 from groma.features.external import ExternalMatches
 from groma.features.images import GrayImage
 from groma.features.segments import Segments
@@ -103,7 +104,7 @@ class Straightener:
         ends = np.hstack([places[rows, first], places[rows, last]])
         keep = inside.any(1) & (segment2.length(ends) >= shortest)
         bent = self._bend(ends[keep].reshape(-1, 2)).reshape(-1, 4)
-        return Segments(bent, found.sigma[keep], found.strength[keep])
+        return replace(found.select(keep), ends=bent)
 
     def _bend(self, pixels: FloatArray) -> FloatArray:
         """Pixels of the original image, from pixels of the resampled one."""
@@ -187,4 +188,8 @@ def given_segments(
 
 def _given_in(folder: Path, known: set[str], external: ExternalMatches, name: str) -> Segments:
     """The given segments of an image, none where they are not known."""
-    return external.segments_of(name, read_gray(folder / name)) if name in known else Segments.empty()
+    if name not in known:
+        return Segments.empty()
+    image = read_gray(folder / name)
+    found = external.segments_of(name, image)
+    return replace(found, contrast=contrast_of(image, found))

@@ -35,6 +35,7 @@ from groma.adjustment.survey.attach import check_survey
 from groma.adjustment.survey.given import Survey
 from groma.execution import begin, work_with
 from groma.features.close_edges import CloseEdges
+from groma.features.contrast import WithContrast
 from groma.features.external import ExternalMatches
 from groma.features.matches import LineMatches
 from groma.features.registry import DETECTORS
@@ -293,7 +294,7 @@ def find_segments(
     if not options.refine_poses:
         # Cameras are determined better by places that vary less from view to view, lines by those on the edges.
         detector = CloseEdges(detector)
-    return detect_segments(folder, scene, detector, say)
+    return detect_segments(folder, scene, WithContrast(detector), say)
 
 
 def _find_lines(

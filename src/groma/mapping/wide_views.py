@@ -9,7 +9,7 @@ edge that runs across a border to both, in parts that do not overlap. Within a v
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -147,7 +147,7 @@ class WideViews:
         # In a panorama, on across the border rather than back through the image.
         end = start + self.model.pixel_difference(self.params, self.model.project(self.params, second), start)
         sigma = segments.sigma * self.noise_ratio(view, first, second)
-        return Segments(np.hstack([start, end]), sigma, segments.strength)
+        return replace(segments, ends=np.hstack([start, end]), sigma=sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,11 +170,7 @@ class WideDetection:
         for view, source in enumerate(self.sources):
             flat = cv2.remap(image, source, None, cv2.INTER_CUBIC, borderMode=border)  # type: ignore[call-overload]
             parts.append(self.views.to_image(view, self._own(view, detector.detect(flat))))
-        return Segments(
-            np.concatenate([part.ends for part in parts]),
-            np.concatenate([part.sigma for part in parts]),
-            np.concatenate([part.strength for part in parts]),
-        )
+        return Segments.joined(parts)
 
     def _own(self, view: int, found: Segments) -> Segments:
         """The parts of segments that belong to a view, as far as they are long enough to be found."""
@@ -189,7 +185,7 @@ class WideDetection:
         rows = np.arange(len(found))
         ends = np.hstack([places[rows, first], places[rows, last]])
         keep = own.any(axis=1) & (segment2.length(ends) >= shortest)
-        return Segments(ends[keep], found.sigma[keep], found.strength[keep])
+        return replace(found.select(keep), ends=ends[keep])
 
 
 def _rays(model: camera_models.CameraModel, params: FloatArray, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:

@@ -79,6 +79,8 @@ class LineObservations(Table, noun="observation"):
     segment: FloatArray = column(np.float64, 4)
     #: (N,) standard deviation of an end point across the segment, relative to the usual one; 1 if left out.
     sigma: FloatArray = column(np.float64, fill=1.0, check=check_sigma)
+    #: (N,) gradient of the segment over that of the image beside it; 0 where it is not known.
+    contrast: FloatArray = column(np.float64, fill=0.0)
 
 
 @dataclass(frozen=True, eq=False)

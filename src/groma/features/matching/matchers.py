@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -44,7 +44,7 @@ class WideBaselineMatcher:
         straight = model.undistort_pixels(params, segments.ends.reshape(-1, 2)).reshape(-1, 4)
         straight = np.where(np.isfinite(straight).all(1, keepdims=True), straight, segments.ends)
         near = nearby_points(segments, view.point_pixels, view.point_ids, self.options.reach)
-        ideal = Segments(straight, segments.sigma, segments.strength)
+        ideal = replace(segments, ends=straight)
         pose = view.cam_from_world
         if pose is not None:
             pose = np.column_stack([quaternion.to_matrix(pose[:4]), pose[4:]])

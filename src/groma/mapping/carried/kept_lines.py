@@ -68,9 +68,8 @@ def _with_lines(
     ids = out.lines.ids.max(initial=0) + 1 + np.arange(len(fresh))
     lines = replace(Lines.through(ends, ids), confidence=one.lines.confidence[fresh])
     used = np.flatnonzero(row[seen.line_idx] >= 0)
-    added = LineObservations(
-        image[seen.image_idx[used]], row[seen.line_idx[used]], seen.segment[used], seen.sigma[used]
-    )
+    added = seen.take(used)
+    added = added.replace(image_idx=image[added.image_idx], line_idx=row[added.line_idx])
     observation = np.full(one.num_line_observations, -1)
     observation[chosen[used]] = out.num_line_observations + np.arange(len(used))
     moved = Similarity(1.0 if one.has_scale and scene.has_scale else scale)

@@ -2,17 +2,20 @@
 r"""How probable it is that a line is right, from what its observations say.
 
 A line is called right where an edge of the object runs along it, at least along half of it, within 2.5 thousandths of
-the usual distance of lines from their cameras. Three things must be true of it:
+the usual distance of lines from their cameras. Four things must be true of it:
 
-.. math:: p = \frac{1}{1 + \exp(-w_0 - \sum_k w_k x_k)}
+.. math:: p = \frac{1}{1 + \exp(-w_0 - \sum_k w_k x_k)}\; \frac{1}{1 + \exp(-w_t x_t)}\;
           \operatorname{erf}\frac{\tau}{\sqrt 2\, u}\; \operatorname{erf}\frac{1}{\sqrt 2\, r}.
 
-The first factor, that there is an edge at all, is a logistic model of four quantities (:func:`line_evidence`). The
-second is the probability of a normal error within :math:`\tau = 0.0025`, where u is the standard deviation across the
+The first factor, that its segments belong together, is a logistic model of three quantities (:func:`line_evidence`).
+The second, that they are no texture, is one of the prominence alone: contrast
+(:mod:`groma.features.contrast`) times relative length, since texture has stripes of the same contrast beside it, and
+its stripes are short. Where views agree on texture, as they do on stripes of a wall, only this factor tells. The third
+is the probability of a normal error within :math:`\tau = 0.0025`, where u is the standard deviation across the
 line that half of its places do not exceed, over the usual distance: by its segments, or by the planes that meet in it
-where these tell more, as tread and riser do of the edge of a step that all images see from one height. The third is the
-share of normal residuals of r pixels root mean square within the width of an edge, a pixel: contours that move with the
-view and chords of curves fit no single line, and where segments of a curve are bowed their standard deviations, and
+where these tell more, as tread and riser do of the edge of a step that all images see from one height. The fourth is
+the share of normal residuals of r pixels root mean square within the width of an edge, a pixel: contours that move with
+the view and chords of curves fit no single line, and where segments of a curve are bowed their standard deviations, and
 with them r, say so.
 
 No quantity depends on the unit of length or on how many pixels an image has. The weights were fitted on rendered scenes
@@ -44,7 +47,9 @@ from groma.mapping.noise.landmarks import LineNoise, line_noise
 from groma.scene import Scene
 
 #: The quantities, and the weight of each as ``benchmarks/line_confidence.py`` found it.
-WEIGHTS: dict[str, float] = {"constant": 0.481, "spread": 1.210, "support": 1.363, "length": 1.539, "residual": -2.072}
+WEIGHTS: dict[str, float] = {
+    "constant": 1.738, "spread": 0.218, "support": 2.608, "residual": -1.946, "prominence": 3.126,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -53,6 +58,11 @@ class ConfidenceGates:
 
     tolerance: float = gate(0.0025, "1", "error of a right line over the distance", "convention: two pixels")
     edge_px: float = gate(SEGMENTS.edge, "px", "residual of a segment of a right line", "derived from an edge's width")
+    texture: float = gate(
+        3.0, "1", "prominence of a line that is as likely an edge as texture",
+        "derived from normal gradients, which exceed two standard deviations, three times their median, in 1 of 22",
+    )  # fmt: skip
+    usual_contrast: float = gate(30.0, "1", "of segments whose contrast is unknown", "chosen on the scenes of the fit")
 
 
 GATES = ConfidenceGates()
@@ -73,8 +83,14 @@ def line_confidence(scene: Scene, surface_px: float = SURFACE_SIGMA_PX) -> Float
     """Return the probability (L,) that each line is right; surfaces deviate from planes by ``surface_px``."""
     noise = line_noise(scene)
     accuracy = begin(partial(line_accuracy, scene, noise, surface_px=surface_px))
-    right = scipy.special.expit(line_evidence(scene, noise) @ np.array(list(WEIGHTS.values())))
+    right = edge_probability(line_evidence(scene, noise), np.array(list(WEIGHTS.values())))
     return right * accuracy()
+
+
+def edge_probability(evidence: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return the probability (L,) that there is an edge, from what :func:`line_evidence` returns and its weights."""
+    together, no_texture = evidence[:, :-1] @ weights[:-1], evidence[:, -1] * weights[-1]
+    return np.asarray(scipy.special.expit(together) * scipy.special.expit(no_texture))
 
 
 def line_accuracy(
@@ -96,14 +112,15 @@ def line_evidence(scene: Scene, noise: LineNoise | None = None) -> FloatArray:
 
     ``noise`` is that of the lines, if it is known.
 
-    ============  =================================================================================================
-    ``constant``  1
-    ``spread``    logarithm of :math:`\sqrt{\lambda}`, the smaller eigenvalue of the mean of :math:`n n^\top` over the
-                  normals of its viewing planes: how far apart the views are, as the sine of an angle
-    ``support``   log odds of an image showing it, among the images in whose frame it lies
-    ``length``    logarithm of its longest observed segment over the median of those of all lines
-    ``residual``  logarithm of the root mean square of its residuals, pixels
-    ============  =================================================================================================
+    ==============  ===============================================================================================
+    ``constant``    1
+    ``spread``      logarithm of :math:`\sqrt{\lambda}`, the smaller eigenvalue of the mean of :math:`n n^\top` over the
+                    normals of its viewing planes: how far apart the views are, as the sine of an angle
+    ``support``     log odds of an image showing it, among the images in whose frame it lies
+    ``residual``    logarithm of the root mean square of its residuals, pixels
+    ``prominence``  mean over its segments of the logarithm of their contrast, plus that of its longest observed
+                    segment over the median of those of all lines, less that of ``ConfidenceGates.texture``
+    ==============  ===============================================================================================
     """
     seen, noise = scene.line_observations, line_noise(scene) if noise is None else noise
     images = num_distinct(seen.line_idx, seen.image_idx, scene.num_lines)
@@ -115,10 +132,20 @@ def line_evidence(scene: Scene, noise: LineNoise | None = None) -> FloatArray:
             np.ones(scene.num_lines),
             np.log(_spread(scene, noise)),
             np.log((images + 0.5) / (expected - images + 0.5)),
-            np.log(longest / (np.median(longest) if len(longest) else 1.0)),
             np.log(_residual_px(scene, noise)),
+            _log_contrast(scene) + np.log(longest / (np.median(longest) if len(longest) else 1.0) / GATES.texture),
         ]
     )
+
+
+def _log_contrast(scene: Scene) -> FloatArray:
+    """(L,) mean logarithm of the contrast of the segments of each line; the usual one where none is known."""
+    seen = scene.line_observations
+    known = seen.contrast > 0.0
+    line, logs = seen.line_idx[known], np.log(seen.contrast[known])
+    count = np.bincount(line, minlength=scene.num_lines)
+    mean = np.bincount(line, logs, scene.num_lines) / np.maximum(count, 1)
+    return np.where(count > 0, mean, math.log(GATES.usual_contrast))
 
 
 def _residual_px(scene: Scene, noise: LineNoise) -> FloatArray:

@@ -66,12 +66,13 @@ class LineMap:
     def add_to(self, scene: Scene, segments: Sequence[Segments]) -> Scene:
         """Return the scene with these lines and their observations in place of its own lines."""
         first = np.cumsum([0, *(len(one) for one in segments)])[self.image_idx] + self.segment_idx
-        measured = np.concatenate([np.zeros((0, 4)), *(one.ends for one in segments)])[first]
-        sigma = np.concatenate([np.zeros(0), *(one.sigma for one in segments)])[first]
-        usual = float(np.median(sigma)) if len(sigma) else 1.0
+        seen = Segments.joined(segments).select(first)
+        usual = float(np.median(seen.sigma)) if len(seen) else 1.0
         lines = scene.keep(lines=[]).replace(
             lines=Lines.through(self.segments),
-            line_observations=LineObservations(self.image_idx, self.line_idx, measured, sigma / usual),
+            line_observations=LineObservations(
+                self.image_idx, self.line_idx, seen.ends, seen.sigma / usual, seen.contrast
+            ),
             relations=Relations(point_on_plane=scene.relations.point_on_plane),
         )
         return with_supported_intervals(lines)
