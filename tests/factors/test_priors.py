@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, logm
 
-from groma.errors import ShapeError
+from groma.errors import InputError, ShapeError
 from groma.factors._examples import make_example, random_poses
 from groma.factors._record import poses_from_states
 from groma.factors.checks.check import check_factor, linearized, residuals_of
@@ -29,6 +29,15 @@ EACH = Ref("poses", np.arange(N))
 @pytest.fixture
 def rng():
     return np.random.default_rng(17)
+
+
+def test_measurements_are_finite_and_references_of_one_length(rng):
+    poses = random_poses(rng, N, rotation=0.5)
+    with pytest.raises(ShapeError, match=r"PoseBetween.second must have one index per factor, 6 like its first; got 5"):
+        PoseBetween(first=EACH, second=Ref("poses", np.arange(N - 1)), first_from_second=poses)
+    poses[2, 4] = np.nan
+    with pytest.raises(InputError, match=r"PosePrior.cam_from_world must be finite; row 2 is .* \(1 such rows\)"):
+        PosePrior(pose=EACH, cam_from_world=poses)
 
 
 def hat(xi):

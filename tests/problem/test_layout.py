@@ -102,6 +102,11 @@ def test_private_intrinsics_are_merged_with_their_pose(intrinsics_of_camera, wid
     if widths == [9]:
         member = layout.kept[0].members[1]
         np.testing.assert_array_equal(member.blocks(intrinsics_of), camera)
+        blocks = layout.kept[0].blocks_of(np.arange(layout.num_kept_unknowns))
+        np.testing.assert_array_equal(layout.unknowns["poses"], blocks[:, :6])
+        np.testing.assert_array_equal(layout.unknowns[member.group], blocks[member.block_of, 6:])
+    places = np.concatenate([part.ravel() for part in layout.unknowns.values()])
+    np.testing.assert_array_equal(np.sort(places), np.arange(layout.num_kept_unknowns))
 
 
 def test_uncoupled_variables_are_problems_of_their_own():

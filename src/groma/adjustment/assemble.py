@@ -75,6 +75,8 @@ TERMS: tuple[Term, ...] = (
 )
 #: Types of factors that are observations of points in images.
 POINT_FACTORS = ("point_reprojection", "stereo_point")
+#: Columns of the scene that groups of variables of the same name hold as they are.
+COLUMNS = {"frames": "rig_from_world", "sensors": "cam_from_rig", "control_points": "xyz", "directions": "vectors"}
 #: A point this many times farther away than its cameras from each other moves linearly in its inverse depth.
 FAR_FROM_CAMERAS = 2.0
 
@@ -153,19 +155,13 @@ def disassemble(scene: Scene, problem: Problem) -> Scene:
         if group in states:
             params[members, : states[group].shape[1]] = states[group]
     tables: dict[str, object] = {"cameras": scene.cameras.replace(params=params)}
-    if "frames" in states:
-        tables["frames"] = scene.frames.replace(rig_from_world=states["frames"])
-    if "sensors" in states:
-        tables["sensors"] = scene.sensors.replace(cam_from_rig=states["sensors"])
+    for name, column in COLUMNS.items():
+        if name in states:
+            tables[name] = getattr(scene, name).replace(**{column: states[name]})
     if MOTIONS in states:
-        motion = states[MOTIONS][:-1]
-        tables["camera_motions"] = scene.camera_motions.replace(motion=motion)
+        tables["camera_motions"] = scene.camera_motions.replace(motion=states[MOTIONS][:-1])
     if "points" in states:
         tables["points"] = scene.points.replace(xyz=problem.variables["points"].ambient())
-    if "control_points" in states:
-        tables["control_points"] = scene.control_points.replace(xyz=states["control_points"])
-    if "directions" in states:
-        tables["directions"] = scene.directions.replace(vectors=states["directions"])
     scene = scene.replace(**tables)
     if "lines" in states:
         scene = scene.with_lines(problem.variables["lines"].ambient())

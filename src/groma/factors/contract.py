@@ -33,7 +33,7 @@ import numpy as np
 
 from groma._typing import Columns, FloatArray, Inputs, IntArray
 from groma.errors import ProblemError, ShapeError
-from groma.factors._record import check_finite, normalize_rows, set_rows
+from groma.factors._measured import check_finite, normalize_rows, set_rows
 from groma.factors.losses import Loss, Trivial
 from groma.geometry.manifold import Manifold
 

@@ -61,7 +61,7 @@ from groma._numba import kernel
 from groma._typing import Columns, FloatArray, Inputs
 from groma.errors import InputError, ShapeError
 from groma.factors._examples import indices, make_example
-from groma.factors._record import set_rows
+from groma.factors._measured import set_rows
 from groma.factors._user_loops import Loops
 from groma.factors.contract import Example, Factor, Invariance, Ref, Slot, register
 from groma.geometry.manifold import AMBIENT_SIZE, Euclidean

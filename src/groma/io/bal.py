@@ -215,15 +215,8 @@ def _scene(image_idx: IntArray, point_idx: IntArray, pixel: FloatArray, camera: 
         )
     poses = BAL.cam_from_world(camera[:, :3], camera[:, 3:6])
     poses[:, :4] /= np.linalg.norm(poses[:, :4], axis=1, keepdims=True)
-    cameras = Cameras(
-        ids=np.arange(count) + 1,
-        models=("BAL",) * count,
-        params=camera[:, 6:],
-        width=np.zeros(count, int),
-        height=np.zeros(count, int),
-    )
     return Scene.from_images(
-        cameras,
+        Cameras.of(np.arange(count) + 1, ["BAL"] * count, list(camera[:, 6:]), np.zeros((count, 2))),
         [f"{index:05d}" for index in range(count)],
         np.arange(count),
         poses,

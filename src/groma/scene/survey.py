@@ -7,7 +7,7 @@ points of the scene: it is found in images by hand or by its target, and it has 
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
@@ -19,7 +19,7 @@ import numpy.typing as npt
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
 from groma.scene.landmarks import check_normals, check_unit
-from groma.scene.table import OBJECTS, Table, check_sigma, check_unique, column, text_column
+from groma.scene.table import OBJECTS, Table, check_sigma, check_unique, column, joined, text_column
 
 if TYPE_CHECKING:
     from groma.scene.scene import Scene
@@ -116,6 +116,11 @@ class ControlPoints(Table, noun="control point", optional=True):
     def is_check(self) -> BoolArray:
         """(N,) whether the coordinates are kept back to check the result."""
         return self.role == CHECK
+
+    def with_unmeasured(self, names: Sequence[str], xyz: FloatArray) -> Self:
+        """Return these points and others at places (M, 3) whose coordinates nobody measured."""
+        covariance, role = np.tile(np.eye(3), (len(names), 1, 1)), np.full(len(names), UNKNOWN)
+        return joined(self, type(self)(tuple(names), xyz, xyz, covariance, role))
 
 
 @dataclass(frozen=True, eq=False)

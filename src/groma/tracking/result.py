@@ -34,9 +34,7 @@ def map_to_scene(track_map: TrackMap, camera: TrackCamera, relations: bool = Tru
         Points seen in fewer keyframes are left out, if there are as many keyframes.
     """
     living = track_map.living()
-    cameras = Cameras(
-        np.array([1]), (PINHOLE,), camera.params[None], np.array([camera.width]), np.array([camera.height])
-    )
+    cameras = Cameras.of([1], [PINHOLE], [camera.params], [camera.width, camera.height])
     if not living:
         return Scene(cameras=cameras)
     names, used = [], set()

@@ -30,17 +30,9 @@ from groma.gates import NORMAL
 from groma.geometry import quaternion
 from groma.geometry.algebra import unit
 from groma.io.survey import DirectionsFile, DistancesFile, PlanesFile, PosesFile
-from groma.scene import (
-    CameraPoses,
-    ControlPoints,
-    Distances,
-    Held,
-    KnownDirections,
-    KnownPlanes,
-    Marks,
-    Scene,
-)  # fmt: skip
-from groma.scene.survey import DIRECTED, LOCATED, UNKNOWN, Kind
+from groma.scene import CameraPoses, Distances, Held, KnownDirections, KnownPlanes, Marks, Scene
+from groma.scene.survey import DIRECTED, LOCATED, Kind
+from groma.scene.table import joined
 
 _LANDMARK = re.compile(r"(point|line|plane|direction):(\d+)")
 _KINDS = {"point": Kind.POINT, "line": Kind.LINE, "plane": Kind.PLANE, "direction": Kind.DIRECTION}
@@ -119,23 +111,10 @@ def with_measured_points(scene: Scene, survey: Survey, notes: list[str]) -> Scen
     mine = np.flatnonzero(of[seen.point_idx] >= 0)
     squares = squared_residuals_px(assemble(scene.keep(lines=[]), AssemblyOptions()))["points"]
     sigma = max(noise_of(squares), 0.05) * seen.sigma[mine]
-    xyz, unit = scene.points.xyz[rows], np.tile(np.eye(3), (len(rows), 1, 1))
-    points, marks = scene.control_points, scene.marks
-    marked = Marks(
-        np.append(marks.image_idx, seen.image_idx[mine]),
-        np.append(marks.point_idx, of[seen.point_idx[mine]]),
-        np.concatenate([marks.pixel, seen.pixel[mine]]),
-        np.append(marks.sigma, sigma),
-        np.append(marks.rejected, np.zeros(len(mine), bool)),
-    )
+    marked = Marks(seen.image_idx[mine], of[seen.point_idx[mine]], seen.pixel[mine], sigma)
     notes.append(f"Made control points, with their observations as marks: {', '.join(named)}.")
-    return scene.keep(points=of < 0).replace(
-        control_points=ControlPoints(
-            (*points.names, *named), np.concatenate([points.xyz, xyz]), np.concatenate([points.measured, xyz]),
-            np.concatenate([points.covariance, unit]), np.append(points.role, np.full(len(rows), UNKNOWN)),
-        ),
-        marks=marked,
-    )  # fmt: skip
+    points = scene.control_points.with_unmeasured(named, scene.points.xyz[rows])
+    return scene.keep(points=of < 0).replace(control_points=points, marks=joined(scene.marks, marked))
 
 
 def distance_table(scene: Scene, given: DistancesFile, stated: float | None, notes: list[str]) -> Distances:

@@ -32,8 +32,8 @@ from groma.problem.gauge import world_motions
 from groma.problem.problem import Problem
 from groma.problem.residuals import jacobians_of, residuals_of, root_matrices
 from groma.problem.variables import Variables
-from groma.scene import ControlPoints, Distances, Keypoints, Scene, Similarity
-from groma.scene.survey import UNKNOWN, Kind, accepted
+from groma.scene import Distances, Keypoints, Scene, Similarity
+from groma.scene.survey import Kind, accepted
 
 #: Cost: steps of a fit that ends before, and where it has converged.
 _STEPS, _TOLERANCE = 50, 1e-6
@@ -113,16 +113,8 @@ def _with_places(scene: Scene) -> Scene:
             places.append(_feet(table.anchor[rows], objects[index[rows]]))
             kind[rows], index[rows] = Kind.CONTROL_POINT, sum(map(len, places[:-1])) + np.arange(len(rows))
         tables[name] = table.replace(**{kinds: kind, column: index})
-    xyz = np.concatenate(places)
-    count = len(xyz) - len(scene.control_points)
-    points, unit = scene.control_points, np.tile(np.eye(3), (count, 1, 1))
-    points = ControlPoints(
-        (*points.names, *(f"place {row} on an object" for row in range(count))),
-        xyz,
-        np.concatenate([points.measured, xyz[len(points) :]]),
-        np.concatenate([points.covariance, unit]),
-        np.append(points.role, np.full(count, UNKNOWN)),
-    )
+    new = np.concatenate(places[1:])
+    points = scene.control_points.with_unmeasured([f"place {row} on an object" for row in range(len(new))], new)
     return scene.replace(control_points=points, **tables)
 
 

@@ -45,7 +45,8 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import Columns, FloatArray, Inputs
 from groma.factors._examples import indices, make_example, random_poses
-from groma.factors._record import put_block, put_residual, set_rows
+from groma.factors._measured import set_rows
+from groma.factors._record import put_block, put_residual
 from groma.factors.contract import WORLD_FIXED, Example, Factor, Invariance, Measurement, Ref, Slot, register
 
 

@@ -80,7 +80,7 @@ class QueryCamera:
 
     def table(self) -> Cameras:
         """The camera as the only row of a table."""
-        return Cameras(np.array([1]), (self.model,), self.params[None], np.array([self.width]), np.array([self.height]))
+        return Cameras.of([1], [self.model], [self.params], [self.width, self.height])
 
     @staticmethod
     def of(table: Cameras, row: int) -> QueryCamera:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from groma._numba import loop
@@ -57,6 +59,11 @@ def split(layout: Layout, x: FloatArray) -> list[FloatArray]:
     return [x[c.unknowns] for c in layout.kept]
 
 
+def joined(parts: Iterable[FloatArray]) -> FloatArray:
+    """Return parts by class, of any shape, as one flat vector."""
+    return np.concatenate([np.zeros(0), *(part.reshape(-1) for part in parts)])
+
+
 def product(layout: Layout, blocks: Blocks, x: FloatArray) -> FloatArray:
     """Return the product of a symmetric block matrix, given by its upper blocks, with a flat vector."""
-    return np.concatenate(multiply(layout, blocks, split(layout, np.ascontiguousarray(x))))
+    return joined(multiply(layout, blocks, split(layout, np.ascontiguousarray(x))))

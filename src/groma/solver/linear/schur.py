@@ -28,6 +28,7 @@ from groma._typing import FloatArray, IntArray
 from groma.problem.layout import Chunk, Eliminated, Layout
 from groma.problem.linearization import NormalEquations
 from groma.problem.parallel import OrderedSums, Spans, sum_of
+from groma.solver.linear.blocks import joined
 
 #: Diagonal entries are damped as if they were at least this large, so that nothing is divided by zero. It is no
 #: tolerance: entries change with the square of the unit of length, and what the solver does must not.
@@ -283,7 +284,7 @@ class ReducedSystem:
 
     def flat_diagonal(self) -> FloatArray:
         """Return the diagonal of H, (unknowns,)."""
-        return np.concatenate([self.diagonal(c).reshape(-1) for c in range(len(self.layout.kept))])
+        return joined(self.diagonal(c) for c in range(len(self.layout.kept)))
 
     def largest_landmark_slope(self) -> float:
         """Return the largest component of the landmarks' gradient over the root of its diagonal entry of V."""

@@ -12,7 +12,7 @@ from groma.errors import ProblemError
 from groma.problem.layout import KeptClass, Layout, Member
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
-from groma.solver.linear.blocks import split
+from groma.solver.linear.blocks import joined, split
 from groma.solver.linear.choice import linear_solver
 from groma.solver.linear.contract import LinearSolver
 from groma.solver.linear.pcg import ConjugateGradients
@@ -93,8 +93,8 @@ class SharedSystem:
             # Blocks that this shard does not touch were given a one, so that they could be inverted.
             steps = np.arange(kept.width)
             system.S[c, c][: kept.count, steps, steps] -= system.diagonal(c) == 0.0
-        curvature, gradient, rhs = system.flat_diagonal(), system.equations.g_kept, system.rhs
-        sums = {"curvature": curvature, "gradient": np.concatenate(gradient), "rhs": np.concatenate(rhs)}
+        gradient, rhs = joined(system.equations.g_kept), joined(system.rhs)
+        sums = {"curvature": system.flat_diagonal(), "gradient": gradient, "rhs": rhs}
         for name, at in layout.unknowns.items():
             for kind, values in sums.items():
                 exact_sums.add(self._sums[kind, self._groups.index(name)], values[at])

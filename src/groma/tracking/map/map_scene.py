@@ -94,9 +94,7 @@ def map_scene(
     **more
         Further tables of the scene.
     """
-    cameras = Cameras(
-        np.array([1]), (PINHOLE,), camera.params[None], np.array([camera.width]), np.array([camera.height])
-    )
+    cameras = Cameras.of([1], [PINHOLE], [camera.params], [camera.width, camera.height])
     count = len(points.ids)
     return Scene.from_images(
         cameras,

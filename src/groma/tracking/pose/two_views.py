@@ -119,9 +119,7 @@ def adjusted(camera: TrackCamera, candidate: Candidate, pixels: FloatArray, sigm
     """
     views, count = len(pixels), len(candidate.places)
     image, point = np.repeat(np.arange(views), count), np.tile(np.arange(count), views)
-    cameras = Cameras(
-        np.array([1]), (PINHOLE,), camera.params[None], np.array([camera.width]), np.array([camera.height])
-    )
+    cameras = Cameras.of([1], [PINHOLE], [camera.params], [camera.width, camera.height])
     scene = Scene.from_images(
         cameras,
         [str(view) for view in range(views)],
