@@ -221,6 +221,21 @@ def test_search_by_name(opened, scene):
     assert "point" in kinds
 
 
+def test_search_lists_names_that_go_on_after_what_is_typed_and_shows_a_line_from_near(opened, scene):
+    page = opened()
+    found = "search($('search').value).map(found => found.kind)"
+    page.fill("#search", "lin")
+    assert page.evaluate(found) == ["line"] * scene.num_lines
+    page.fill("#search", "p")
+    assert page.evaluate(found) == ["plane", *["point"] * 7, "camera", "camera"]  # a few of many; first.jpg, second.jpg
+    size = page.locator("#scene").bounding_box()
+    page.fill("#search", f"line {scene.lines.ids[3]}")
+    page.press("#search", "Enter")
+    length = float(np.linalg.norm(np.diff(scene.lines.segments[3], axis=0)))
+    assert page.evaluate("eye.distance") <= 5.001 * length
+    assert page.locator("#scene").bounding_box() == size  # the panel scrolls
+
+
 def _measured(page) -> dict[str, str]:
     return dict(
         zip(page.locator("#about dt").all_inner_texts(), page.locator("#about dd").all_inner_texts(), strict=True)
