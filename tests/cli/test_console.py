@@ -222,3 +222,12 @@ def test_colours_are_for_terminals_where_nobody_asked_for_none(environment, is_t
     assert ("\x1b[" in said.out) == ("\x1b[" in said.err) == coloured
     plain = re.sub(r"\x1b\[\d+m", "", said.out + said.err)
     assert plain == "          number\n  points       3\nWrote out\nwarning: odd\n"
+
+
+@pytest.mark.parametrize(("own", "said"), [("", "Later runs start at once."), ("/tmp/groma-x", "NUMBA_CACHE_DIR")])
+def test_compiling_is_announced_as_the_first_time_only_where_it_is_kept(own, said, monkeypatch, capsys):
+    from groma._kernels import folder
+
+    monkeypatch.setattr(folder, "_own", own)
+    Console(False, False, None)._announce_compilation()
+    assert said in capsys.readouterr().out

@@ -30,6 +30,14 @@ def test_a_file_appears_when_the_block_ends_well(tmp_path):
     assert os.listdir(tmp_path) == ["a.txt"]
 
 
+def test_an_error_names_the_result_and_not_its_draft(tmp_path):
+    with (
+        pytest.raises(OutputError, match=f"^Cannot write {tmp_path}/page.html: No space left on device. Choose"),
+        atomic_output(tmp_path / "page.html", force=False) as draft,
+    ):
+        raise OutputError(f"Cannot write {draft}: No space left on device. Choose another place.")
+
+
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError, OutputError])
 def test_nothing_is_left_when_it_does_not(tmp_path, error):
     with pytest.raises(error), atomic_output(tmp_path / "model", force=False) as draft:

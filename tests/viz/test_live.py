@@ -48,6 +48,7 @@ def test_a_track_from_waiting_to_finished(tmp_path, scene):
         assert view.num_frames == 2
         assert view.scene is not None
         assert view.scene.num_lines == scene.num_lines
+        assert len(np.unique(view._nodes["lines"][0].colors.reshape(-1, 3), axis=0)) == 1
         assert not view.refresh()
         (work / "scene.npz").write_bytes(b"being replaced")
         view.refresh()
@@ -60,6 +61,7 @@ def test_a_track_from_waiting_to_finished(tmp_path, scene):
         assert view.refresh()
         assert view.state == live.FINISHED
         assert view.num_frames == 3
+        assert len(np.unique(view._nodes["lines"][0].colors.reshape(-1, 3), axis=0)) > 1  # by direction
 
 
 STATUSES = "0.0 starting 0 0 0 0\n0.1 tracked 210 31 2 1\n0.2 lost 0 0 0 0\n0.3 weak 9 1 0 0\n0.4 tra"

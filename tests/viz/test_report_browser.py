@@ -208,9 +208,14 @@ def test_a_junction_lights_up_both_lines(opened, scene):
 
 def test_search_by_name(opened, scene):
     page = opened()
+    # A few of the names that go on after what is typed, and first.jpg, second.jpg.
+    assert page.evaluate("search('p').map(found => found.kind)") == ["plane", *["point"] * 7, "camera", "camera"]
+    size = page.locator("#scene").bounding_box()
     page.fill("#search", f"line {scene.lines.ids[3]}")
     page.press("#search", "Enter")
     assert page.evaluate("[chosen.kind, chosen.index]") == ["line", 3]
+    assert page.evaluate("eye.distance / lines.lengths[3]") < 5.001  # from near
+    assert page.locator("#scene").bounding_box() == size  # the panel scrolls
     page.fill("#search", "second")
     page.click("#found button")
     assert page.evaluate("[chosen.kind, chosen.index, current]") == ["camera", 1, 1]

@@ -17,6 +17,11 @@ from numba.core import config
 _own: str | None = None
 
 
+def is_own() -> bool:
+    """Whether compiled functions are kept there, and end with this process."""
+    return bool(_own)
+
+
 def take_own() -> bool:
     """Keep compiled functions there from now on; return False if they are already, or no folder can be made."""
     global _own

@@ -51,8 +51,8 @@ def atomic_output(
         _sync(draft)
         _put(draft, target, workshop)
     except OSError as error:
-        if isinstance(error, OutputError):
-            raise
+        if isinstance(error, OutputError):  # what is inside names the draft
+            raise OutputError(str(error).replace(str(workshop / "draft"), str(path))) from error
         raise OutputError(f"Cannot write {path}: {error.strerror or error}.") from error
     finally:
         shutil.rmtree(workshop, ignore_errors=True)

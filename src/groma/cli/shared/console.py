@@ -102,7 +102,13 @@ class Console:
     def _announce_compilation(self) -> None:
         if not self.quiet and can_rewrite(sys.stderr):
             sys.stderr.write("\r\x1b[K")  # the line of progress
-        self.say("First run: compiling for this machine. Later runs start at once.")
+        if (folder := sys.modules.get("groma._kernels.folder")) is not None and folder.is_own():
+            self.say(
+                "Compiling for this machine, in every run, because there is no folder to keep compiled code in: set "
+                "NUMBA_CACHE_DIR to one that can be written."
+            )
+        else:
+            self.say("First run: compiling for this machine. Later runs start at once.")
 
     def progress(self) -> Progress:
         """Return the progress of an adjustment, shown by :class:`groma.cli.shared.progress.Line`."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """glTF 2.0 files: points, lines, planes and cameras for Blender, web pages and viewers of every kind.
 
-``.glb`` is one binary file, ``.gltf`` is JSON with the numbers inside. The node ``scene`` turns the up direction of
-photographs to +y, as glTF has it, and shifts the scene to its middle, because numbers are in single precision; its
+``.glb`` is one binary file, ``.gltf`` is JSON with the numbers inside. The node ``scene`` turns up to
++y, as glTF has it, and shifts the scene to its middle, because numbers are in single precision; its
 ``extras`` hold the shift. Below it every plane is a node of its own, and every image is a node with a camera.
 
 Reference: Khronos Group, *glTF 2.0 Specification*, 2021. There cameras look along -z with y up.
@@ -173,7 +173,7 @@ def _glass(colour: list[int]) -> dict[str, Any]:
 
 
 def _upright(shown: DrawnCameras) -> list[float]:
-    """Return the quaternion [x y z w] that turns the up direction of the photographs to +y."""
+    """Return the quaternion [x y z w] that turns up to +y."""
     up = shown.up
     axis = np.cross(up, [0.0, 1.0, 0.0])
     if up[1] < -1.0 + 1e-12:

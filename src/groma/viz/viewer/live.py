@@ -25,6 +25,7 @@ from groma.io import read_scene
 from groma.io.reading import reading
 from groma.io.trajectories import read_tum
 from groma.scene.patches import plane_patches
+from groma.viz.colours import of_lines
 from groma.viz.pack import thin
 from groma.viz.viewer import arrays as _view_arrays
 from groma.viz.viewer.glance import Picture, Statuses, read_now, read_statuses, timeline
@@ -70,7 +71,7 @@ class LiveView:
         self.num_frames = 0
         self.scene: Scene | None = None
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
-        server.gui.set_panel_label("groma: a running track")
+        server.gui.set_panel_label(f"groma: {output.absolute().name}")
         server.gui.main_panel.dock_right()
         # The world is the first camera, whose y points down.
         server.scene.set_up_direction("-y")
@@ -82,7 +83,9 @@ class LiveView:
 
     def _add_panel(self) -> None:
         gui = self.server.gui
-        self.picture = gui.add_image(np.full((3, 4, 3), 40, np.uint8), label="Now", format="jpeg", visible=False)
+        self.picture = gui.add_image(
+            np.full((3, 4, 3), 40, np.uint8), label="Latest frame", format="jpeg", visible=False
+        )
         self.timeline = gui.add_html("", visible=False)
         self.frame_shown = gui.add_slider("Frame", min=1, max=2, step=1, initial_value=2, visible=False)
         self.frame_shown.hint = "Where the camera was; at the right end, where it is."
@@ -192,8 +195,10 @@ class LiveView:
             self.server.scene.remove_by_name("/lines")
             nodes["lines"] = []
             if scene.num_lines:
+                # In a growing map the heaviest directions may change places.
+                hues = of_lines(scene) if self.state == FINISHED else _LINES
                 lines = _view_arrays.add_segments(
-                    self.server, "/lines", scene.lines.segments, _LINES, 2.0, shown["lines"]
+                    self.server, "/lines", scene.lines.segments, hues, 2.0, shown["lines"]
                 )
                 nodes["lines"].append(lines)
             self.server.scene.remove_by_name("/keyframes")

@@ -82,14 +82,20 @@ function showAbout() {
 onChoice.push(showAbout);
 
 // ------------------------------------------------------------------ search
-const MOST_FOUND = 12;
+const MOST_FOUND = 12, MOST_BEGUN = 8; // in all; of names that go on after what is typed
 function search(text) {
-  const words = text.trim().toLowerCase(), match = /^([a-z]*)\s*#?(-?\d+)$/.exec(words), found = [];
+  const words = text.trim().toLowerCase(), match = /^([a-z]*)\s*#?(-?\d*)$/.exec(words), found = [];
   if (!words) return found;
-  if (match) for (const [kind, table] of [["line", lines], ["plane", planes], ["point", points], ["direction", directions]]) {
-    const index = kind.startsWith(match[1]) ? table.ids.indexOf(+match[2]) : -1;
+  const kinds = match ? [["line", lines], ["plane", planes], ["point", points], ["direction", directions]].filter(([kind]) => kind.startsWith(match[1])) : [];
+  for (const [kind, table] of kinds) {
+    const index = match[2] ? table.ids.indexOf(+match[2]) : -1;
     if (index >= 0) found.push({ kind, index });
   }
+  if (match && match[1]) for (const [kind, table] of kinds)
+    for (let index = 0; index < table.ids.length && found.length < MOST_BEGUN; index++) {
+      const id = String(table.ids[index]);
+      if (id.startsWith(match[2]) && id !== match[2]) found.push({ kind, index });
+    }
   for (let index = 0; index < cameras.names.length && found.length < MOST_FOUND; index++)
     if (cameras.names[index].toLowerCase().includes(words)) found.push({ kind: "camera", index });
   return found;
@@ -105,6 +111,7 @@ function takeFound(thing) {
   $("found").hidden = true; $("search").blur();
   const middle = middleOf(thing);
   if (middle) eye.pivot = middle;
+  if (thing.kind === "line") eye.distance = Math.min(eye.distance, Math.max(5 * lines.lengths[thing.index], 0.05 * data.view.distance));
   choose(thing, "search");
 }
 $("search").addEventListener("input", showFound);
