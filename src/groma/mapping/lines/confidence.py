@@ -48,7 +48,7 @@ from groma.scene import Scene
 
 #: The quantities, and the weight of each as ``benchmarks/line_confidence.py`` found it.
 WEIGHTS: dict[str, float] = {
-    "constant": 1.738, "spread": 0.218, "support": 2.608, "residual": -1.946, "prominence": 3.126,
+    "constant": 1.542, "spread": 1.262, "support": 2.695, "residual": -2.451, "prominence": 3.098,
 }  # fmt: skip
 
 
