@@ -62,7 +62,8 @@ def _files(folder: Path) -> dict[str, bytes]:
 def _stages(work: Path) -> Iterator[Made]:
     """Yield the results of stages of a map, and an archive with every table."""
     rng = np.random.default_rng(1)
-    kept = npz(counts=[1, 2], ends=rng.uniform(0, 9, (3, 4)), sigma=np.ones(3), strength=np.ones(3), contrast=np.ones(3))
+    ones = dict.fromkeys(("sigma", "strength", "contrast"), np.ones(3))
+    kept = npz(counts=[1, 2], ends=rng.uniform(0, 9, (3, 4)), **ones)
     yield "kept_segments", {"s.npz": kept}, one(SEGMENTS.read, "s.npz")
     names = ("image_idx", "segment_idx", "line_idx", "residual", "num_images", "median_residual", "uncertainty")
     line_map = dict.fromkeys(names, np.zeros(1)) | {"lines": np.zeros((1, 6)), "segments": np.zeros((1, 2, 3))}
