@@ -38,7 +38,7 @@ class ContrastGates:
 
 GATES = ContrastGates()
 #: Places along a segment at which the grey levels beside it are taken (cost: time), and segments at a time (memory).
-_PLACES, _BATCH = (np.arange(32) + 0.5) / 32, 2000
+_PLACES, _BATCH = ((np.arange(32) + 0.5) / 32).astype(np.float32), 2000
 
 
 @dataclass(frozen=True)
@@ -76,9 +76,9 @@ def _gradient_beside(smooth: npt.NDArray[np.float32], segments: Segments) -> Flo
     shift = np.concatenate([-steps[::-1], steps])[:, None] * across  # (N, 2 K, 2)
     size = np.array(smooth.shape[::-1])
     inside = [((ends + shift >= 0.0) & (ends + shift <= size)).all(axis=2) for ends in (first, last)]
-    places = first + _PLACES[:, None] * (last - first)
-    pixel = (places[:, None] + shift[:, :, None] - 0.5).astype(np.float32).reshape(len(segments), -1, 2)
-    levels = cv2.remap(smooth, pixel, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+    start, way = (first + shift - 0.5).astype(np.float32), (last - first).astype(np.float32)
+    x, y = ((start[..., k, None] + _PLACES * way[..., k, None]).reshape(len(segments), -1) for k in (0, 1))
+    levels = cv2.remap(smooth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     profile = levels.reshape(len(segments), 2 * len(steps), -1).mean(axis=2, dtype=np.float64)
     profile[~(inside[0] & inside[1])] = np.nan
     rises = np.abs(np.diff(profile, axis=1))

@@ -39,8 +39,7 @@ def focal_length_that_does_not_fit(track_map: TrackMap, camera: TrackCamera, gat
     job = job_of(track_map, camera, living, held, False, options=options) if len(living) > 1 else None
     if job is None:
         return []
-    params = camera.params[None, [0, 2, 3]]
-    one = Cameras(np.array([1]), (_MODEL,), params, np.array([camera.width]), np.array([camera.height]))
+    one = Cameras.of([1], [_MODEL], [camera.params[[0, 2, 3]]], [camera.width, camera.height])
     # Depths that features had where the map was lost are columns under the given focal length.
     scene = job.scene.replace(cameras=one, point_depths=job.scene.point_depths.take(np.zeros(0, np.int64)))
     if len(scene.right_columns) < gates.min_columns:
