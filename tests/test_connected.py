@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import scipy.sparse.csgraph
 
-from groma._connected import connected_parts
+from groma._rows import connected_parts
 
 
 @pytest.mark.parametrize("num_pairs", [0, 30, 60, 200])

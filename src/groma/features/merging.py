@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from groma._connected import connected_parts
+from groma._rows import connected_parts
 from groma._trees import kd_tree
 from groma._typing import FloatArray
 from groma.features.segments import SEGMENTS

@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from groma._connected import connected_parts
+from groma._rows import connected_parts
 from groma._typing import IntArray
 from groma.scene.scene import Scene
 

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from groma._connected import connected_parts
+from groma._rows import connected_parts
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
 from groma.geometry import se3

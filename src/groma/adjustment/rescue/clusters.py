@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from groma._connected import connected_parts
+from groma._rows import connected_parts
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assemble import POINT_FACTORS
 from groma.adjustment.rescue.restart import GATES, triangulated_anew, went_elsewhere, with_cameras

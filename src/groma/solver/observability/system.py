@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from groma._connected import connected_parts
+from groma._rows import connected_parts
 from groma._typing import BoolArray, FloatArray
 from groma.solver.linear.blocks import Blocks
 from groma.solver.linear.modes import Modes, divided, scaled

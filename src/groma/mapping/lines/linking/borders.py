@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from groma._connected import connected_parts
+from groma._rows import connected_parts
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.mapping.groups import distinct_pairs
 from groma.mapping.lines.gates import AGREEMENT
