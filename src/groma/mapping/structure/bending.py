@@ -44,8 +44,11 @@ class BendingGates:
     members: int = gate(6, "members", "of a quarter at least, points and segment ends", "derived from two an unknown")
 
 
+GATES = BendingGates()
+
+
 def bending(
-    marks: Landmarks, planes: PlaneSet, points: Pairs, lines: Pairs, level: float, gates: BendingGates = BendingGates()
+    marks: Landmarks, planes: PlaneSet, points: Pairs, lines: Pairs, level: float, gates: BendingGates = GATES
 ) -> BoolArray:
     """Return which planes (K,) bend by more than a plane may, surely; those of few members are not told.
 
