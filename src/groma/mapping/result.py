@@ -180,15 +180,18 @@ class MapResult:
         with atomic_output(folder, force, work) as draft:
             others = draft.with_name("others")
             others.mkdir()
-            with beside(partial(write_scene, self.scene, draft, format="colmap")):
-                self._write_others(others, photographs or self.photographs(images), title, numbers)
+            with beside(partial(self._write_scene, draft, others)):
+                self._write_page(others, photographs or self.photographs(images), title, numbers)
             for file in others.iterdir():
                 file.rename(draft / file.name)
 
-    def _write_others(self, folder: Path, photographs: Photographs, title: str, numbers: dict[str, Any]) -> None:
-        """Write what is not part of the COLMAP model."""
-        write_scene(self.scene, folder / "scene.npz")
-        write_geometry(self.scene, folder)
+    def _write_scene(self, model: Path, others: Path) -> None:
+        write_scene(self.scene, model, format="colmap")
+        write_scene(self.scene, others / "scene.npz")
+        write_geometry(self.scene, others)
+
+    def _write_page(self, folder: Path, photographs: Photographs, title: str, numbers: dict[str, Any]) -> None:
+        """Write the page and what else says how good the map is."""
         write_report(
             folder / "report.html",
             self.before,
