@@ -34,8 +34,7 @@ def poses(
     from groma.io import read_scene
 
     scores = evaluate_poses(read_scene(estimate), read_scene(reference))
-    for warning in scores.warnings:
-        console.warn(warning)
+    console.warn(*scores.warnings)
     console.say(f"{counted(scores.num_images, 'images')} in both, after similarity alignment")
     if scores.num_missing:
         missing = counted(scores.num_missing, "images")
@@ -256,8 +255,7 @@ def trajectory(
         theirs = read_trajectory(reference, format, read_times(times))
         console.detail(f"The poses of {reference} have the times of {times}.")
     scores = score_trajectory(ours, theirs, align, max_time_difference, rpe_delta, rpe_unit)
-    for warning in scores.warnings:
-        console.warn(warning)
+    console.warn(*scores.warnings)
     applied = {"se3": "rotation and translation", "sim3": f"similarity of scale {scores.similarity.scale:.6g}"}
     console.say(
         f"{counted(scores.num_poses, 'poses')} associated by {scores.association} of {scores.num_estimate:,} and "

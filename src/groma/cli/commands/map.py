@@ -286,8 +286,7 @@ def _start(
     if poses is None:
         return (None if model is None else read_scene(model)), options
     given = scene_at_poses(images, poses, options.point_model())
-    for sentence in given.sentences:
-        console.say(sentence)
+    console.say(*given.sentences)
     if given.calibrated:  # a model that came with parameters is the one of the scene
         return given.scene, options if options.camera_params is None else replace(options, camera_model=None)
     return given.scene, replace(options, camera_model=None, refine_intrinsics=options.refine_intrinsics is not False)

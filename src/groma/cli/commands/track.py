@@ -135,8 +135,7 @@ def track(
         files = getattr(frames, "pictures", {})  # of a video there are none
         pictures = {name: files[name] for name in result.scene.images.names if name in files}
         unwritten = result.write(output, f"Track of {_output.subject(sequence)}", force, pictures or None)
-    for sentence in unwritten:
-        console.warn(sentence)
+    console.warn(*unwritten)
     remove_stages(work)
     numbers = result.summary()
     _say(console, numbers)
