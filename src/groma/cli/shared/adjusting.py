@@ -197,16 +197,20 @@ def _write_page(
     found: SceneUncertainty | None,
 ) -> None:
     """Write the page, before and after; covariances give standard deviations to what is measured on it."""
-    from groma.viz.report.covariances import covariances_of
+    from groma.viz.report.covariances import LandmarkCovariances, centers_of_images
     from groma.viz.report.page import PageContents, write_report
     from groma.viz.report.survey import survey_card
     from groma.viz.report.tables import contributions_card
 
+    known = None
+    if found is not None:
+        centers = centers_of_images(result.scene, found.centers, result.scene.images.frame_idx)
+        known = LandmarkCovariances(found.gauge, found.points, found.lines, found.planes, centers)
     contents = PageContents(
         warnings=numbers["warnings"],
         diagnosis=numbers["diagnosis"],
         cards=contributions_card(numbers.get("contributions")) + survey_card(numbers.get("survey")),
-        covariances=None if found is None else covariances_of(result.scene, found),
+        covariances=known,
     )
     title = f"Adjustment of {_output.subject(source)}"
     with _output.atomic_output(path, force) as draft:
