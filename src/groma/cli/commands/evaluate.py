@@ -17,7 +17,7 @@ from groma.errors import InputError
 _Format = Literal["auto", "tum", "kitti", "euroc"]
 _Alignment = Literal["se3", "sim3", "none"]
 _StepUnit = Literal["frames", "metres", "seconds"]
-_MAX_ANGLE = 10.0
+_MAX_ANGLE, _MAX_TIME = 10.0, 0.01  # derived from groma.evaluation.gates.SCORES
 
 
 def poses(
@@ -220,7 +220,7 @@ def trajectory(
     align: Annotated[_Alignment, _options.PLAIN.option("Alignment of EST to REF; sim3 for monocular.")] = "se3",
     max_time_difference: Annotated[
         float, _options.PLAIN.option("Largest difference of associated times, s.", metavar="S")
-    ] = 0.01,
+    ] = _MAX_TIME,
     times: Annotated[
         Path | None,
         _options.PLAIN.option(

@@ -102,7 +102,7 @@ def map_(
     ] = None,
     min_length: Annotated[
         float, _options.LANDMARKS.option("Minimum length of line segments, pixels.", min=5.0, metavar="PX")
-    ] = 12.0,
+    ] = 12.0,  # derived from groma.mapping.lines.options
     cluster_size: Annotated[
         int,
         _options.LANDMARKS.option(
@@ -110,7 +110,7 @@ def map_(
             min=0,
             metavar="N",
         ),
-    ] = 250,
+    ] = 250,  # derived from groma.mapping.lines.options
     min_confidence: Annotated[
         float,
         _options.LANDMARKS.option(
@@ -130,7 +130,7 @@ def map_(
     ] = None,
     max_iterations: Annotated[
         int, _options.ADJUSTMENT.option("Stop each adjustment after N steps.", min=1, metavar="N")
-    ] = 50,
+    ] = 50,  # derived from groma.mapping.options
     refine_points: Annotated[
         bool,
         _options.ADJUSTMENT.option(
