@@ -20,7 +20,7 @@ def test_all_is_sorted_without_repetition():
 
 
 def test_all_equals_the_lazy_names():
-    assert set(groma._RENAMED) <= set(groma._HOME) <= set(groma.__all__)
+    assert set(groma._HOME) <= set(groma.__all__)
     for name in set(groma.__all__) - set(groma._HOME):
         assert inspect.ismodule(getattr(groma, name))
 

@@ -10,68 +10,24 @@ import zlib as _zlib  # noqa: F401  (before pycolmap, whose library hides Python
 
 from groma._version import __version__ as __version__
 
-#: Public names by the module that they live in; two have other names there. Type checkers read ``__init__.pyi``.
-_NAMES = {
-    "adjustment.adjust": "AdjustOptions adjust",
-    "adjustment.contributions": "contributions",
-    "adjustment.covariance_files": "write_covariances",
-    "adjustment.diagnosis": "diagnose",
-    "adjustment.graphs.pose_graph": "PoseGraphOptions PoseGraphResult adjust_pose_graph",
-    "adjustment.parts": "adjust_parts write_parts",
-    "adjustment.report": "AdjustResult",
-    "adjustment.survey.align": "Alignment align",
-    "adjustment.survey.given": "Survey",
-    "adjustment.survey.records": "Reliability",
-    "adjustment.survey.reliability": "reliability",
-    "adjustment.uncertainty": "uncertainty",
-    "compilation.warmup": "warm_up",
-    "errors": "FileFormatError GromaError InputError OutputError ProblemError ShapeError",
-    "estimators.motion.estimation": "Motion MotionOptions estimate_motion",
-    "estimators.motion.matches": "LandmarkMatches",
-    "evaluation.lines": "evaluate_lines",
-    "evaluation.planes": "evaluate_planes",
-    "evaluation.poses": "evaluate_poses",
-    "evaluation.trajectory": "evaluate_trajectory",
-    "factors.contract": "Ref",
-    "factors.losses": "loss",
-    "factors.observations.line_bearing": "LineBearing",
-    "factors.observations.line_reprojection": "LineReprojection",
-    "factors.observations.plane_observation": "PlaneObservation",
-    "factors.observations.point_reprojection": "PointReprojection",
-    "factors.priors.pose_prior": "PosePrior",
-    "factors.relations.line_on_plane": "LineOnPlane",
-    "factors.relations.point_on_plane": "PointOnPlane",
-    "factors.user": "factor",
-    "io": "read_scene read_trajectory write_scene",
-    "io.convert": "convert",
-    "io.sequences": "open_sequence",
-    "localization.localizer": "LocalizeOptions LocalizedImage Localizer",
-    "localization.pose.absolute_pose": "AbsolutePose PoseOptions estimate_absolute_pose",
-    "localization.pose.camera": "QueryCamera",
-    "mapping.map": "map_images",
-    "mapping.options": "MapOptions",
-    "mapping.result": "MapResult",
-    "mapping.surveyed": "SurveyedResult adjust_surveyed",
-    "problem.problem": "Problem",
-    "problem.variables": "Variables",
-    "scene": "Scene Similarity",
-    "solver.options": "SolverOptions",
-    "solver.report": "SolveReport",
-    "solver.solve": "Solution solve",
-    "solver.termination": "Termination",
-    "tracking": "TrackOptions TrackResult Tracker track",
-    "viz.report.page": "write_report",
-}
-_HOME = {name: f"groma.{module}" for module, names in _NAMES.items() for name in names.split()}
-_RENAMED = {"diagnose": "diagnose_scene", "evaluate_trajectory": "score_trajectory"}
 
-#: Sub-packages, and modules, that are loaded in the same way.
-_SUBPACKAGES = frozenset(
-    (
-        "adjustment cameras compilation errors estimators evaluation factors features geometry io localization mapping "
-        "problem scene solver testing tracking viz"
-    ).split()
-)
+def _read_stub() -> tuple[dict[str, tuple[str, str]], frozenset[str]]:
+    """Return each public name with its module and its name there, and the sub-packages: as the stub imports them."""
+    homes, packages = {}, set()
+    with open(__file__.rpartition(".")[0] + ".pyi", encoding="utf-8") as stub:
+        for line in stub:
+            match line.split():
+                case ["from", "groma", "import", package, *_]:
+                    packages.add(package)
+                case ["from", module, "import", name, *_] if name != "__version__":
+                    homes[name] = module, name
+                case [name, "=", name_there]:
+                    homes[name] = homes.pop(name_there)
+    return homes, frozenset(packages)
+
+
+#: Public names by their home, and sub-packages and modules that are loaded in the same way.
+_HOME, _SUBPACKAGES = _read_stub()
 __all__ = sorted([*_HOME, *_SUBPACKAGES])  # pyright: ignore[reportUnsupportedDunderAll]  (it reads the stub)
 
 
@@ -79,7 +35,8 @@ def __getattr__(name: str) -> object:
     from importlib import import_module  # not before: a command answers Ctrl-C once this file is loaded
 
     if name in _HOME:
-        value = getattr(import_module(_HOME[name]), _RENAMED.get(name, name))
+        module, name_there = _HOME[name]
+        value = getattr(import_module(module), name_there)
     elif name in _SUBPACKAGES:
         value = import_module(f"groma.{name}")
     else:

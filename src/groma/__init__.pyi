@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What type checkers see of :mod:`groma`, whose names are loaded when they are first used."""
+"""Public names of :mod:`groma`. Type checkers read them here, and ``__init__.py``, which loads them on first use."""
 
 from groma import adjustment as adjustment
 from groma import cameras as cameras

@@ -48,7 +48,7 @@ def any_width(size: int) -> BoolArray:
 
 def width_for(count: int, most: int) -> Callable[[int], Any]:
     """Return :func:`width`, or :func:`any_width` where blocks are few, and few beside the most of their kind."""
-    return any_width if count < min(_FEW, most // 4) else width
+    return any_width if count < min(_FEW, most // 4) else width  # cost: time only
 
 
 class _Vectors:

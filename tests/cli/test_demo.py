@@ -52,20 +52,20 @@ def test_cabinet_is_measured_right():
     same = Similarity()
     larger = _cabinet.HALF_SIZE + np.array([0.01, -0.02, 0.005])
     scores = _cabinet.score_cabinet(scene.replace(lines=Lines.through(_box(larger))), same)
-    assert (scores.num_edges, scores.num_lines) == (12, 12)
-    np.testing.assert_allclose(scores.size, 2 * larger, atol=1e-9)
+    assert (scores["num_edges"], scores["num_lines"]) == (12, 12)
+    np.testing.assert_allclose(scores["size"], 2 * larger, atol=1e-9)
     # Four edges each at hypot(0.02, 0.005), hypot(0.01, 0.005) and hypot(0.01, 0.02): the first is the median.
-    assert scores.distance == pytest.approx(np.hypot(0.02, 0.005), abs=1e-9)
+    assert scores["distance"] == pytest.approx(np.hypot(0.02, 0.005), abs=1e-9)
     # Lines elsewhere, across, or too short belong to no edge; a side without lines leaves the size unknown.
     box = _box(_cabinet.HALF_SIZE)
     short = box.mean(1, keepdims=True) + 0.1 * (box - box.mean(1, keepdims=True))
     for wrong in (box + 0.3, short):
         scores = _cabinet.score_cabinet(scene.replace(lines=Lines.through(wrong)), same)
-        assert scores.num_edges == 0 and np.isnan(scores.size).all() and np.isnan(scores.distance)
+        assert scores["num_edges"] == 0 and np.isnan(scores["size"]).all() and np.isnan(scores["distance"])
     said = _cabinet.sentences(
         {
             "poses": {"before": {"center_rmse": 0.02}, "after": {"center_rmse": 0.01}},
-            "cabinet": {"num_edges": 0, "num_lines": 0, "size": scores.size, "size_measured": 2 * _cabinet.HALF_SIZE},
+            "cabinet": scores,
             "right_angles_deg": [],
         }
     )

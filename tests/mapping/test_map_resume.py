@@ -19,7 +19,7 @@ from groma.execution import work_with
 from groma.io import read_scene
 from groma.io.colmap.sfm import PointModelOptions, reconstruct_points
 from groma.mapping import map as mapping
-from groma.mapping.checkpoint_files import SCENE
+from groma.mapping.checkpoint_files import SCENE, FileKind
 from groma.mapping.checkpoints import Stages, digest, has_stages, remove_stages, stage
 from groma.mapping.map import MapOptions
 from groma.mapping.read_rows import adjust_as_measured, adjust_read_rows
@@ -141,7 +141,7 @@ def test_the_lock_is_found_before_anything_is_said(tmp_path, corner, monkeypatch
     assert said.err.startswith(f"groma: Another run (process {os.getpid()}) works in out.work. Wait")
 
 
-def test_a_place_that_cannot_be_written_is_said(tmp_path, model, monkeypatch):
+def test_a_place_that_cannot_be_written_is_said(tmp_path, model):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="Cannot keep finished stages in"), Stages(tmp_path / "file", "key", None):
         pass
@@ -149,12 +149,11 @@ def test_a_place_that_cannot_be_written_is_said(tmp_path, model, monkeypatch):
     def full(scene, path):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("groma.mapping.checkpoint_files.write_archive", full)
     with (
         Stages(tmp_path / "work", "key", None) as stages,
         pytest.raises(OutputError, match=r"No space left.*Make room"),
     ):
-        stages.run(stage("points", SCENE)(lambda *_: model))
+        stages.run(stage("points", FileKind(full, SCENE.read))(lambda *_: model))
 
 
 def test_a_full_disk_ends_the_command_in_one_line_and_loses_nothing(tmp_path, corner, monkeypatch, capsys):

@@ -21,11 +21,12 @@ from groma.tracking.frame.planes import frame_planes
 from groma.tracking.frame.sparse_depth import fill_sparse
 from groma.tracking.frame.stereo import dense_disparities, match_right
 from groma.tracking.gates import DEFAULT
-from groma.tracking.map.landmarks import ALIVE, DEAD, LineTable, PlaneTable, PointTable
+from groma.tracking.map.landmarks import ALIVE, DEAD, SAMPLES_KEPT, LineTable, PlaneTable, PointTable
 from groma.tracking.map.lines import assign, carried, line_ends
 from groma.tracking.map.planes import add_planes, assign_planes, grow, merge_planes
+from groma.tracking.map.track_map import TrackMap
 from groma.tracking.map.triangulation import triangulate
-from groma.tracking.pose.estimate import LOSSES, MapView, estimate_pose, rough_pose
+from groma.tracking.pose.estimate import LOSSES, estimate_pose, rough_pose
 from groma.tracking.pose.prediction import MotionModel
 from groma.tracking.pose.relocalise import pose_from_matches
 
@@ -69,7 +70,7 @@ def test_pose_from_points_with_outliers():
     rng = np.random.default_rng(0)
     table, measured = _points(rng, 200)
     measured.pixel[:40] += rng.uniform(20, 60, (40, 2))
-    view = MapView(table, LineTable(), PlaneTable())
+    view = TrackMap(table, LineTable(), PlaneTable())
     empty = Measurements.empty()
     found = estimate_pose(CAMERA, view, Measurements(measured, empty.lines, empty.planes), IDENTITY, WIDE)
     # 160 points of half a pixel: below a tenth of a pixel, 0.2 mrad, and 0.5 mm at 2.5 units.
@@ -83,7 +84,7 @@ def test_from_a_rough_pose_the_last_loss_leads_to_the_same_minimum():
     """Points with wrong matches among them, from 5 cm and 3 degrees away."""
     table, measured = _points(np.random.default_rng(3), 150)
     measured.pixel[:40] += np.random.default_rng(4).uniform(10, 60, (40, 2))
-    view, empty = MapView(table, LineTable(), PlaneTable()), Measurements.empty()
+    view, empty = TrackMap(table, LineTable(), PlaneTable()), Measurements.empty()
     told = CAMERA, view, Measurements(measured, empty.lines, empty.planes), IDENTITY, WIDE
     rough = rough_pose(*told, IDENTITY)
     assert np.abs(se3.log(se3.compose(rough[None], se3.inverse(TRUE[None])))).max() < 0.01
@@ -95,7 +96,7 @@ def test_from_a_rough_pose_the_last_loss_leads_to_the_same_minimum():
 def test_points_weigh_by_their_own_noise():
     """The information of the points of a noisy frame is less by the square of their standard deviation."""
     table, measured = _points(np.random.default_rng(0), 100, noise=0.2)
-    view, empty = MapView(table, LineTable(), PlaneTable()), Measurements.empty()
+    view, empty = TrackMap(table, LineTable(), PlaneTable()), Measurements.empty()
     noisy = dataclasses.replace(measured, sigma=3 * measured.sigma)
     first, second = (
         estimate_pose(CAMERA, view, Measurements(table, empty.lines, empty.planes), IDENTITY, WIDE).information
@@ -107,7 +108,7 @@ def test_points_weigh_by_their_own_noise():
 
 def test_pose_from_lines_alone():
     table, measured = _lines(np.random.default_rng(1), 30)
-    view, empty = MapView(PointTable(), table, PlaneTable()), Measurements.empty()
+    view, empty = TrackMap(PointTable(), table, PlaneTable()), Measurements.empty()
     found = estimate_pose(CAMERA, view, Measurements(empty.points, measured, empty.planes), IDENTITY, WIDE)
     assert np.abs(se3.log(se3.compose(found.pose[None], se3.inverse(TRUE[None])))).max() < 1e-4
     assert found.lines.all()
@@ -119,7 +120,7 @@ def test_one_wall_leaves_three_directions_to_the_prior():
     planes.hesse[0], planes.state[0] = [0, 0, -1, 2.0], ALIVE
     seen = planes_into(TRUE, planes.hesse)
     measured = PlaneMeasurements(np.zeros(1, np.int64), seen, np.diag([200.0, 200.0, 200.0])[None])
-    view, empty = MapView(PointTable(), LineTable(), planes), Measurements.empty()
+    view, empty = TrackMap(PointTable(), LineTable(), planes), Measurements.empty()
     found = estimate_pose(CAMERA, view, Measurements(empty.points, empty.lines, measured), IDENTITY, WIDE)
     assert sorted(found.weak) == ["turn about z", "x", "y"]
     assert np.abs(planes_into(found.pose, planes.hesse) - seen).max() < 1e-4
@@ -164,12 +165,13 @@ def test_planes_are_assigned_by_angle_distance_and_overlap():
     index = add_planes(table, found, np.arange(len(found)), pose)
     near = se3.compose(se3.exp(np.array([[0.02, 0, 0, 0, 0.03, 0]])), pose[None])[0]
     again = frame_planes(camera, _room.render(near)[1], 10.0)
-    first, second = assign_planes(table, again, pose, 0.1, 0.1)
+    gates = dataclasses.replace(DEFAULT.planes, angle=0.1, distance=0.1)
+    first, second = assign_planes(table, again, pose, gates)
     assert len(first) == len(again) == 3
     assert np.abs((table.hesse[first, :3] * planes_back(near, again.plane[second])[:, :3]).sum(1)).min() > 0.999
     # The same plane far away from what was seen is another one.
     table.samples[index] += 5.0
-    assert len(assign_planes(table, again, pose, 0.1, 0.1)[0]) == 0
+    assert len(assign_planes(table, again, pose, gates)[0]) == 0
 
 
 def test_planes_merge_when_they_lie_on_each_other():
@@ -209,7 +211,7 @@ def test_a_plane_keeps_one_sample_of_each_box():
         places = rng.uniform((-3.0, -0.5, -1e-3), (3.0, 0.5, 1e-3), (count, 3))
         grow(table, 0, places, 1.0, gates)
         both, size = np.concatenate([before, places]), gates.box
-        while len({tuple(cell) for cell in np.floor(both / size).tolist()}) > table.samples_kept:
+        while len({tuple(cell) for cell in np.floor(both / size).tolist()}) > SAMPLES_KEPT:
             size *= gates.box_growth
         first = {}
         for place in both.tolist():

@@ -15,8 +15,9 @@ from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 from groma.tracking.frame.camera import TrackCamera, into, planes_into
 from groma.tracking.frame.measurements import DEPTH_BASELINE, LineMeasurements, PlaneMeasurements, PointMeasurements
-from groma.tracking.map.landmarks import ALIVE, LineTable, MapView, PlaneTable, PointTable
-from groma.tracking.map.map_scene import TRACKING, SeenLines, SeenPlanes, SeenPoints, map_scene
+from groma.tracking.map.landmarks import ALIVE, LineTable, PlaneTable, PointTable
+from groma.tracking.map.map_scene import TRACKING, Seen, map_scene
+from groma.tracking.map.track_map import TrackMap
 
 pytestmark = pytest.mark.kernels
 
@@ -55,7 +56,7 @@ def _map(rng, wrong=6):
     root = rng.normal(size=(3, 3, 3)) + 50.0 * np.eye(3)
     flipped = planes_into(TRUE, planes.hesse) * np.array([1.0, -1.0, 1.0])[:, None]
     seen_planes = PlaneMeasurements(np.arange(3), flipped, root)
-    return MapView(points, lines, planes), seen_points, seen_lines, seen_planes
+    return TrackMap(points, lines, planes), seen_points, seen_lines, seen_planes
 
 
 def _both(rng):
@@ -74,8 +75,8 @@ def _both(rng):
     )  # fmt: skip
     image = [np.zeros(len(table), np.int64) for table in (points, lines, planes)]
     scene = map_scene(
-        CAMERA, view, START[None], ["frame"], SeenPoints(points.index, points, image[0]),
-        SeenLines(lines.index, lines, image[1]), SeenPlanes(planes.index, planes, image[2]),
+        CAMERA, view, START[None], ["frame"], Seen(points.index, points, image[0]),
+        Seen(lines.index, lines, image[1]), Seen(planes.index, planes, image[2]),
         pose_priors=PosePriors(np.zeros(1, np.int64), PRIOR[None], SIGMA[None]),
     )  # fmt: skip
     options = {**vars(TRACKING), "refine_landmarks": False}

@@ -88,6 +88,21 @@ class PlaneSet:
     def __len__(self) -> int:
         return len(self.planes)
 
+    def take(self, rows: IntArray, new: IntArray) -> PlaneSet:
+        """Return some of the planes; ``new`` (K,) is the number of each of these here among them, -1 for none."""
+        label = np.append(new, -1)
+        return PlaneSet(
+            planes=self.planes[rows],
+            covariance=self.covariance[rows],
+            support=self.support[rows],
+            share=self.share[rows],
+            band=self.band[rows],
+            log10_false_alarms=self.log10_false_alarms[rows],
+            point_label=label[self.point_label],
+            segment_label=label[self.segment_label],
+            places=[self.places[row] for row in rows],
+        )
+
 
 def find_planes(
     points: FloatArray,

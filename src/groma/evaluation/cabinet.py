@@ -40,19 +40,6 @@ class CabinetGates:
 GATES = CabinetGates()
 
 
-@dataclass(frozen=True)
-class CabinetScores:
-    """A map of the cabinet against the cabinet."""
-
-    #: Number of its twelve edges with a line on them.
-    num_edges: int
-    #: Number of lines on edges, and their median distance from the measured edge, metres.
-    num_lines: int
-    distance: float
-    #: (3,) length, depth and height between lines on opposite edges, metres; NaN where one side has none.
-    size: np.ndarray
-
-
 def folder() -> Path:
     """Return the folder with ``images``, ``model`` (the start) and ``motion_capture`` (poses to compare with)."""
     return Path(str(files("groma"))) / "data" / "cabinet"
@@ -71,16 +58,9 @@ def evaluate_cabinet(start: Scene, scene: Scene, reference: Scene) -> dict[str, 
         Poses by motion capture, in ``folder() / "motion_capture"``.
     """
     before, after = evaluate_poses(start, reference), evaluate_poses(scene, reference)
-    cabinet = score_cabinet(scene, after.alignment)
     return {
         "poses": {"before": before.to_dict(), "after": after.to_dict()},
-        "cabinet": {
-            "num_edges": cabinet.num_edges,
-            "num_lines": cabinet.num_lines,
-            "distance": cabinet.distance,
-            "size": cabinet.size,
-            "size_measured": 2 * HALF_SIZE,
-        },
+        "cabinet": score_cabinet(scene, after.alignment),
         "right_angles_deg": right_angles(scene),
     }
 
@@ -104,8 +84,16 @@ def sentences(numbers: dict[str, Any]) -> list[str]:
     return lines
 
 
-def score_cabinet(scene: Scene, measured_from_scene: Similarity) -> CabinetScores:
-    """Find the lines on the edges of the cabinet, and its size by them."""
+def score_cabinet(scene: Scene, measured_from_scene: Similarity) -> dict[str, Any]:
+    """Find the lines on the edges of the cabinet, and its size by them.
+
+    Returns
+    -------
+    dict
+        ``num_edges`` of its twelve with a line on them, ``num_lines`` on edges, their median ``distance`` from the
+        measured edge (m), ``size`` (3,) as length, depth and height between lines on opposite edges (m; NaN where one
+        side has none), and ``size_measured``.
+    """
     turn = np.array([[np.cos(HEADING), -np.sin(HEADING), 0], [np.sin(HEADING), np.cos(HEADING), 0], [0, 0, 1]])
     ends = (measured_from_scene.points(scene.lines.segments.reshape(-1, 3)) - CENTER) @ turn
     ends = ends.reshape(-1, 2, 3)
@@ -131,7 +119,8 @@ def score_cabinet(scene: Scene, measured_from_scene: Similarity) -> CabinetScore
         if len(low) and len(high):
             size[k] = np.median(high) - np.median(low)
     distance = float(np.median(np.linalg.norm(away[on_edge], axis=1))) if on_edge.any() else float("nan")
-    return CabinetScores(len(edges), int(on_edge.sum()), distance, size)
+    counts = {"num_edges": len(edges), "num_lines": int(on_edge.sum())}
+    return {**counts, "distance": distance, "size": size, "size_measured": 2 * HALF_SIZE}
 
 
 def right_angles(scene: Scene) -> list[float]:

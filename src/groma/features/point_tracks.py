@@ -75,7 +75,7 @@ def follow(
     image_2: GrayImage,
     pixels: FloatArray,
     guesses: FloatArray | None = None,
-    levels: int = 3,
+    levels: int = 3,  # convention: of OpenCV
     window: int = 15,
     round_trip: float | None = 1.0,
 ) -> tuple[FloatArray, BoolArray]:

@@ -31,7 +31,7 @@ from groma.scene import Scene
 #: Images of a map that are asked how often points are found again, at most (cost: time).
 _ASKED = 40
 #: Pieces that lines are cut into, to tell the parts that they cross: one a part, where they cross the whole image.
-_PIECES = 8
+_PIECES = VERDICT.parts
 
 
 @dataclass(frozen=True, eq=False)

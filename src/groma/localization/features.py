@@ -32,6 +32,8 @@ from groma.mapping.image_segments import Straightener
 Bytes = npt.NDArray[np.uint8]
 #: A descriptor of length one, in bytes, has about this length (the format of COLMAP's descriptors).
 _LENGTH = 512.0
+#: Shortest segment unless the caller says so, pixels.
+MIN_LENGTH = 15.0
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,7 @@ def summed(descriptors: Bytes, owner: IntArray, count: int) -> npt.NDArray[np.fl
 
 
 def find_features(
-    image: GrayImage, camera: QueryCamera, lines: bool = True, min_length: float = 15.0
+    image: GrayImage, camera: QueryCamera, lines: bool = True, min_length: float = MIN_LENGTH
 ) -> DescribedImage:
     """Find and describe points and segments; segments without the distortion of the lens."""
 

@@ -28,7 +28,7 @@ from groma.localization.candidates import (
     points_alike,
 )
 from groma.localization.expected import FoundAgain, nearest_images, shown_of
-from groma.localization.features import DescribedImage, DescribedPoints, find_features
+from groma.localization.features import MIN_LENGTH, DescribedImage, DescribedPoints, find_features
 from groma.localization.landmarks import DescribedLandmarks, coarsest, seen_in
 from groma.localization.map_images import OPTIONS, estimated_in_summary, image_paths, images_in_summary
 from groma.localization.map_index import images_told, kept_index
@@ -70,7 +70,7 @@ class LocalizeOptions:
     #: Use lines in addition to points.
     lines: bool = True
     #: Minimum segment length, pixels.
-    min_segment_length: float = 15.0
+    min_segment_length: float = MIN_LENGTH
     #: Whether poses and calibrations of the map were estimated, so that the covariance of each pose includes their
     #: errors. Poses that were held are as exact as the points of the map say, calibrations are exact. None: from the
     #: summary of the map; both where there is none.

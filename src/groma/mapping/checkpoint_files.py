@@ -20,7 +20,6 @@ from groma.io.reading import reading
 from groma.mapping.depth.points import MeasuredDepths
 from groma.mapping.lines.line_map import LineMap
 from groma.mapping.posed.placed import PlacedPhotographs
-from groma.scene import Scene
 from groma.solver.report import Iteration, SolveReport
 from groma.solver.termination import Termination
 
@@ -109,14 +108,10 @@ def _parted(array: Any, counts: IntArray) -> list[Any]:
     return np.split(array, np.cumsum(counts)[:-1]) if len(counts) else []
 
 
-def _write_scene(scene: Scene, path: Path) -> None:
-    write_archive(scene, path)
-
-
 def _write_adjusted(result: AdjustResult, path: Path) -> None:
     # The scene comes last: where it is, the report is.
     _write_report(result.report, path.with_suffix(".report.npz"))
-    _write_scene(result.scene, path)
+    write_archive(result.scene, path)
 
 
 def _read_adjusted(path: Path) -> AdjustResult:
@@ -126,7 +121,7 @@ def _read_adjusted(path: Path) -> AdjustResult:
 def _write_placed(placed: PlacedPhotographs, path: Path) -> None:
     # The scene comes last: where it is, the words are.
     _write_arrays(path.with_suffix(".words.npz"), {"words": np.array(json.dumps([placed.notes, placed.warnings]))})
-    _write_scene(placed.scene, path)
+    write_archive(placed.scene, path)
 
 
 def _read_placed(path: Path) -> PlacedPhotographs:
@@ -141,7 +136,7 @@ def _write_depths(measured: MeasuredDepths, path: Path) -> None:
     # The scene comes last: where it is, the rest is.
     told = {"units": measured.units, "header": np.array(measured.header())}
     _write_arrays(path.with_suffix(".units.npz"), told)
-    _write_scene(measured.scene, path)
+    write_archive(measured.scene, path)
 
 
 def _read_depths(path: Path) -> MeasuredDepths:
@@ -161,7 +156,7 @@ def _read_array(path: Path) -> FloatArray:
         return saved["array"]
 
 
-SCENE = FileKind(_write_scene, read_archive)
+SCENE = FileKind(write_archive, read_archive)
 SEGMENTS = FileKind(_write_segments, _read_segments)
 LINE_MAP = FileKind(_write_line_map, _read_line_map)
 ADJUSTED = FileKind(_write_adjusted, _read_adjusted)

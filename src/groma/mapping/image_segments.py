@@ -28,10 +28,9 @@ from groma.features.external import ExternalMatches
 from groma.features.images import GrayImage
 from groma.features.segments import Segments
 from groma.gates import gate
-from groma.geometry import segment2
 from groma.mapping.photographs import read_gray
 from groma.mapping.wide_views import GATES as WIDE
-from groma.mapping.wide_views import WideDetection, WideViews
+from groma.mapping.wide_views import WideDetection, WideViews, parts_inside
 from groma.scene import Scene
 
 
@@ -44,8 +43,6 @@ class LensGates:
 
 
 GATES = LensGates()
-#: Samples along a segment, to find the part of it inside the image (cost: time).
-_SAMPLES = 65
 
 
 @dataclass(frozen=True)
@@ -92,19 +89,8 @@ class Straightener:
         """Find segments in an image of this camera; their end points are pixels of the image as it is."""
         # The border is repeated: black outside would be an edge all around.
         straight = cv2.remap(image, self.source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
-        found = detector.detect(straight)
-        if len(found) == 0:
-            return found
-        shortest = segment2.length(found.ends).min()
-        along = np.linspace(0.0, 1.0, _SAMPLES)[:, None]
-        places = found.ends[:, None, :2] * (1.0 - along) + found.ends[:, None, 2:] * along
-        inside = self._inside(places.reshape(-1, 2)).reshape(len(found), _SAMPLES)
-        first, last = inside.argmax(1), _SAMPLES - 1 - inside[:, ::-1].argmax(1)
-        rows = np.arange(len(found))
-        ends = np.hstack([places[rows, first], places[rows, last]])
-        keep = inside.any(1) & (segment2.length(ends) >= shortest)
-        bent = self._bend(ends[keep].reshape(-1, 2)).reshape(-1, 4)
-        return replace(found.select(keep), ends=bent)
+        found = parts_inside(detector.detect(straight), self._inside)
+        return replace(found, ends=self._bend(found.ends.reshape(-1, 2)).reshape(-1, 4))
 
     def _bend(self, pixels: FloatArray) -> FloatArray:
         """Pixels of the original image, from pixels of the resampled one."""

@@ -9,6 +9,7 @@ edge that runs across a border to both, in parts that do not overlap. Within a v
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -174,18 +175,21 @@ class WideDetection:
 
     def _own(self, view: int, found: Segments) -> Segments:
         """The parts of segments that belong to a view, as far as they are long enough to be found."""
-        if len(found) == 0:
-            return found
-        shortest = segment2.length(found.ends).min()
-        along = np.linspace(0.0, 1.0, _SAMPLES)[:, None]
-        places = found.ends[:, None, :2] * (1.0 - along) + found.ends[:, None, 2:] * along
-        rays = self.views.from_view(view, places.reshape(-1, 2))
-        own = self.views.is_own(view, rays).reshape(len(found), _SAMPLES)
-        first, last = own.argmax(axis=1), _SAMPLES - 1 - np.fliplr(own).argmax(axis=1)
-        rows = np.arange(len(found))
-        ends = np.hstack([places[rows, first], places[rows, last]])
-        keep = own.any(axis=1) & (segment2.length(ends) >= shortest)
-        return replace(found.select(keep), ends=ends[keep])
+        return parts_inside(found, lambda pixels: self.views.is_own(view, self.views.from_view(view, pixels)))
+
+
+def parts_inside(found: Segments, is_inside: Callable[[FloatArray], BoolArray]) -> Segments:
+    """Return what of each segment lies inside, from the first to the last such pixel; none shorter than any found."""
+    if len(found) == 0:
+        return found
+    along = np.linspace(0.0, 1.0, _SAMPLES)[:, None]
+    places = found.ends[:, None, :2] * (1.0 - along) + found.ends[:, None, 2:] * along
+    inside = is_inside(places.reshape(-1, 2)).reshape(len(found), _SAMPLES)
+    first, last = inside.argmax(axis=1), _SAMPLES - 1 - inside[:, ::-1].argmax(axis=1)
+    rows = np.arange(len(found))
+    ends = np.hstack([places[rows, first], places[rows, last]])
+    keep = inside.any(axis=1) & (segment2.length(ends) >= segment2.length(found.ends).min())
+    return replace(found.select(keep), ends=ends[keep])
 
 
 def _rays(model: camera_models.CameraModel, params: FloatArray, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:

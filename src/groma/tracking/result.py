@@ -3,15 +3,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from groma.scene import Relations, Scene
 from groma.scene.camera import Cameras
 from groma.tracking.frame.camera import PINHOLE, TrackCamera
-from groma.tracking.frame.measurements import LineMeasurements, PlaneMeasurements, PointMeasurements
-from groma.tracking.map.map_scene import SeenLines, SeenPlanes, SeenPoints, map_scene
+from groma.tracking.map.map_scene import Seen, map_scene, stacked
 from groma.tracking.map.relations import find_relations
 from groma.tracking.map.track_map import TrackMap
 
@@ -42,30 +39,15 @@ def map_to_scene(track_map: TrackMap, camera: TrackCamera, relations: bool = Tru
         name = keyframe.name or f"{keyframe.index:06d}"
         names.append(name if name not in used else f"{keyframe.index:06d}_{name}")
         used.add(names[-1])
-    measured = [track_map.living_measurements(keyframe) for keyframe in living]
-    image = {
-        kind: np.repeat(np.arange(len(living)), [len(getattr(m, kind)) for m in measured])
-        for kind in ("points", "lines", "planes")
-    }
-    points = PointMeasurements.stack([m.points for m in measured])
-    often = np.bincount(points.index, minlength=len(track_map.points)) >= min(min_views, len(living))
-    keep = often[points.index]
-    points = points.take(keep)
-    lines = LineMeasurements.stack([m.lines for m in measured])
-    planes = PlaneMeasurements.stack([m.planes for m in measured])
-    point_ids, point_idx = np.unique(points.index, return_inverse=True)
-    line_ids, line_idx = np.unique(lines.index, return_inverse=True)
-    plane_ids = np.flatnonzero(track_map.planes.alive)
-    return map_scene(
-        camera,
-        track_map.view,
-        np.array([keyframe.pose for keyframe in living]),
-        names,
-        SeenPoints(point_ids, replace(points, index=point_idx), image["points"][keep]),
-        SeenLines(line_ids, replace(lines, index=line_idx), image["lines"]),
-        SeenPlanes(plane_ids, replace(planes, index=np.searchsorted(plane_ids, planes.index)), image["planes"]),
-        relations=find_relations(track_map, point_ids, line_ids, plane_ids) if relations else Relations(),
-    )
+    measured, image = stacked(track_map, living)
+    often = np.bincount(measured.points.index, minlength=len(track_map.points)) >= min(min_views, len(living))
+    keep = often[measured.points.index]
+    points = Seen.of(measured.points.take(keep), image["points"][keep])
+    lines = Seen.of(measured.lines, image["lines"])
+    planes = Seen.of(measured.planes, image["planes"], np.flatnonzero(track_map.planes.alive))
+    tied = find_relations(track_map, points.ids, lines.ids, planes.ids) if relations else Relations()
+    poses = np.array([keyframe.pose for keyframe in living])
+    return map_scene(camera, track_map, poses, names, points, lines, planes, relations=tied)
 
 
 def about_rest(scene: Scene) -> list[str]:

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """``groma adjust``: bundle adjustment of a COLMAP model, a BAL file or an archive; a pose graph; parts."""
 
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
@@ -9,13 +8,13 @@ import typer
 from groma.cli.shared import command as _complete
 from groma.cli.shared import measurements as _measured
 from groma.cli.shared import options as _options
+from groma.cli.shared.adjusting import WANTED_NOTHING, Wanted, adjust_and_write
 from groma.cli.shared.console import Console
-from groma.errors import InputError, did_you_mean
+from groma.errors import did_you_mean
 
 LineResidual = Literal["endpoints", "bearing", "normal"]
 PlaneResidual = Literal["normal_offset", "quaternion"]
 Keep = Literal["auto", "always", "never"]
-CovarianceGauge = Literal["auto", "inner", "held"]
 
 
 def _check_linear_solver(name: str) -> None:
@@ -31,16 +30,6 @@ def _check_linear_solver(name: str) -> None:
 def adjust(
     console: Console,
     source: _options.Input,
-    output: Annotated[
-        Path | None,
-        _options.PLAIN.option(
-            "Result: a folder (COLMAP model and structures), a groma archive (.npz) or a BAL file (.txt, .bz2, "
-            ".gz). Without it, only reports are written.",
-            "--output",
-            "-o",
-            metavar="OUT",
-        ),
-    ] = None,
     loss: Annotated[
         str,
         _options.ADJUSTMENT.option(
@@ -84,7 +73,6 @@ def adjust(
     refine_rigs: Annotated[
         bool, _options.CAMERAS.option("Estimate the poses of the cameras on their rigs.", "--refine-rigs")
     ] = False,
-    rolling_shutter: _options.RollingShutter = None,
     points: Annotated[bool, _options.ADJUSTMENT.option("Use points.")] = True,
     lines: Annotated[bool, _options.ADJUSTMENT.option("Use lines.")] = True,
     planes: Annotated[bool, _options.ADJUSTMENT.option("Use planes.")] = True,
@@ -131,49 +119,12 @@ def adjust(
             metavar="NAME",
         ),
     ] = None,
-    page: Annotated[
-        Path | None, _options.RESULTS.option("Also write an HTML page: before and after.", "--report", metavar="FILE")
-    ] = None,
-    covariance: Annotated[
-        Path | None,
-        _options.RESULTS.option(
-            "Also write the uncertainty: covariances (.npz) or standard deviations (.json) of images, points, lines, "
-            "planes and directions.",
-            metavar="FILE",
-        ),
-    ] = None,
-    covariance_gauge: Annotated[
-        CovarianceGauge,
-        _options.RESULTS.option(
-            "Gauge of the covariances: inner, all camera centres; held, the first camera and the scale."
-        ),
-    ] = "auto",
-    sigma0: Annotated[
-        float,
-        _options.RESULTS.option(
-            "With --covariance: the measurement noise in units of the stated one (1 pixel unless the scene has "
-            "standard deviations).",
-            metavar="S",
-        ),
-    ] = 1.0,
-    diagnosis: Annotated[
-        bool | None, _options.RESULTS.option("Report what the data do not determine. Default: up to 300 images.")
-    ] = None,
     keep: Annotated[
         Keep,
         _options.ADJUSTMENT.option("With a folder of parts: keep them in memory between steps; auto: as many as fit."),
     ] = "auto",
     measured: _measured.Measured = _measured.NOTHING,
-    protocol: Annotated[
-        Path | None,
-        _measured.PANEL.option(
-            "Also write measurements with residuals, redundancy numbers and tests, as text (adjustment.txt).",
-            metavar="FILE",
-        ),
-    ] = None,
-    contributions: _options.Contributions = False,
-    truth: _options.Truth = None,
-    force: _options.Force = False,
+    wanted: Wanted = WANTED_NOTHING,
 ) -> None:
     """Adjust cameras, points, lines and planes together (bundle adjustment).
 
@@ -183,7 +134,6 @@ def adjust(
     one process or in those started by mpiexec.
     """
     from groma.cli.shared import output as _output
-    from groma.cli.shared.adjusting import Wanted, adjust_and_write
     from groma.cli.shared.input import check_inputs, refuse_idle
     from groma.cli.shared.parts import adjust_parts_and_write, has_company, is_parts
     from groma.cli.shared.pose_graph import adjust_graph_and_write
@@ -193,17 +143,12 @@ def adjust(
         _check_linear_solver(linear_solver)
     measured.validate()
     in_parts = has_company() or is_parts(source)
+    output, force = wanted.output, wanted.force
     if not in_parts:
-        _output.check_outputs(force, output, page, covariance, protocol, json_target=console.json_target)
-    if covariance is not None and covariance.suffix not in (".npz", ".json"):
-        raise InputError(f"--covariance must end in .npz or .json; got {covariance}.")
-    if not 0.0 < sigma0 < float("inf"):
-        raise InputError(f"--sigma0 must be positive; got {sigma0}.")
-    if truth is not None and not contributions:
-        raise InputError("--truth is what --contributions compares with. Add --contributions, or leave it out.")
+        files = (wanted.page, wanted.covariance, wanted.protocol)
+        _output.check_outputs(force, output, *files, json_target=console.json_target)
+    wanted.validate()
     refuse_idle(
-        ("--covariance-gauge", covariance_gauge != "auto" and covariance is None, "with --covariance"),
-        ("--sigma0", sigma0 != 1.0 and covariance is None, "with --covariance"),
         ("--keep", keep != "auto" and not in_parts, "on a folder of parts"),
         (
             "--refine-principal-point",
@@ -212,12 +157,10 @@ def adjust(
         ),
     )
     refused = {  # by what is no scene with images as a whole
-        "--report": page, "--covariance": covariance, "--protocol": protocol, "--contributions": contributions,
-        "--diagnosis": diagnosis, "--camera-model": camera_model, "--rolling-shutter": rolling_shutter,
-        "--keep-suspects": measured.keep_suspects, **measured.given,
+        **wanted.given, "--camera-model": camera_model, "--keep-suspects": measured.keep_suspects, **measured.given,
     }  # fmt: skip
     if not in_parts:
-        check_inputs(source, truth, *measured.files)
+        check_inputs(source, wanted.truth, *measured.files)
     if not in_parts and is_g2o(source):
         refused |= {
             "--gauge": gauge, "--refine-intrinsics": refine_intrinsics, "--refine-rigs": refine_rigs,
@@ -243,21 +186,7 @@ def adjust(
     if in_parts:
         adjust_parts_and_write(source, output, console, options, refused, keep, force)
         return
-    wanted = Wanted(
-        output,
-        page,
-        covariance,
-        covariance_gauge,
-        sigma0,
-        diagnosis,
-        contributions,
-        truth,
-        force,
-        measured,
-        protocol,
-        rolling_shutter,
-    )
-    adjust_and_write(console, source, options, wanted)
+    adjust_and_write(console, source, options, wanted, measured)
 
 
 def _chosen(**options: Any) -> dict[str, Any]:

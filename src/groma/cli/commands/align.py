@@ -89,5 +89,4 @@ def _say(console: Console, found: "Alignment") -> None:
         for row in worst
     ]
     console.table(("largest residuals", "off by", "x", "y", "z", ""), rows)
-    for sentence in found.notes:
-        console.say(sentence)
+    console.say(*found.notes)

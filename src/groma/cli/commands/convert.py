@@ -77,8 +77,7 @@ def _convert(source: Path, target: Path, console: Console, force: bool) -> dict[
     console.wrote(f"{target}: {sentence_of(scene, *kinds)}")
     warnings = [*_missing_images(source, scene), *_unknown_sizes(scene, target), *_unseen_points(source, scene, target)]
     warnings = [] if kinds else [*lost, *warnings]
-    for sentence in warnings:
-        console.warn(sentence)
+    console.warn(*warnings)
     return {**counts_of(scene), "warnings": warnings}
 
 

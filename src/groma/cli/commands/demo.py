@@ -47,8 +47,7 @@ def demo(
     title = "A filing cabinet in 58 photographs"
     write_map(console, result, output, work, replace, images=images, title=title, summary=numbers)
     say_map(console, result, numbers, explain=False)
-    for sentence in cabinet.sentences(numbers):
-        console.say(sentence)
+    console.say(*cabinet.sentences(numbers))
     console.say(f"Open {(output / 'report.html').absolute()} in a browser to walk around it, before and after.")
     console.say("With photographs of your own: groma map IMAGES -o OUT")
     _output.write_json(console.json_target, numbers, force)

@@ -17,7 +17,7 @@ from groma.errors import InputError
 _Format = Literal["auto", "tum", "kitti", "euroc"]
 _Alignment = Literal["se3", "sim3", "none"]
 _StepUnit = Literal["frames", "metres", "seconds"]
-_MAX_ANGLE = 10.0
+_MAX_ANGLE, _MAX_TIME = 10.0, 0.01  # derived from groma.evaluation.gates.SCORES
 
 
 def poses(
@@ -34,8 +34,7 @@ def poses(
     from groma.io import read_scene
 
     scores = evaluate_poses(read_scene(estimate), read_scene(reference))
-    for warning in scores.warnings:
-        console.warn(warning)
+    console.warn(*scores.warnings)
     console.say(f"{counted(scores.num_images, 'images')} in both, after similarity alignment")
     if scores.num_missing:
         missing = counted(scores.num_missing, "images")
@@ -221,7 +220,7 @@ def trajectory(
     align: Annotated[_Alignment, _options.PLAIN.option("Alignment of EST to REF; sim3 for monocular.")] = "se3",
     max_time_difference: Annotated[
         float, _options.PLAIN.option("Largest difference of associated times, s.", metavar="S")
-    ] = 0.01,
+    ] = _MAX_TIME,
     times: Annotated[
         Path | None,
         _options.PLAIN.option(
@@ -256,8 +255,7 @@ def trajectory(
         theirs = read_trajectory(reference, format, read_times(times))
         console.detail(f"The poses of {reference} have the times of {times}.")
     scores = score_trajectory(ours, theirs, align, max_time_difference, rpe_delta, rpe_unit)
-    for warning in scores.warnings:
-        console.warn(warning)
+    console.warn(*scores.warnings)
     applied = {"se3": "rotation and translation", "sim3": f"similarity of scale {scores.similarity.scale:.6g}"}
     console.say(
         f"{counted(scores.num_poses, 'poses')} associated by {scores.association} of {scores.num_estimate:,} and "

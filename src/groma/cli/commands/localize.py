@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 #: Localised photographs in the table; the others are always listed (convention: what a screen can hold).
 _SHOWN = 12
-_MIN_LENGTH = 15.0
+_MIN_LENGTH = 15.0  # derived from LocalizeOptions, whose import would load NumPy
 
 
 def localize(

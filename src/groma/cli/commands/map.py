@@ -102,7 +102,7 @@ def map_(
     ] = None,
     min_length: Annotated[
         float, _options.LANDMARKS.option("Minimum length of line segments, pixels.", min=5.0, metavar="PX")
-    ] = 12.0,
+    ] = 12.0,  # derived from groma.mapping.lines.options
     cluster_size: Annotated[
         int,
         _options.LANDMARKS.option(
@@ -110,7 +110,7 @@ def map_(
             min=0,
             metavar="N",
         ),
-    ] = 250,
+    ] = 250,  # derived from groma.mapping.lines.options
     min_confidence: Annotated[
         float,
         _options.LANDMARKS.option(
@@ -130,7 +130,7 @@ def map_(
     ] = None,
     max_iterations: Annotated[
         int, _options.ADJUSTMENT.option("Stop each adjustment after N steps.", min=1, metavar="N")
-    ] = 50,
+    ] = 50,  # derived from groma.mapping.options
     refine_points: Annotated[
         bool,
         _options.ADJUSTMENT.option(
@@ -286,8 +286,7 @@ def _start(
     if poses is None:
         return (None if model is None else read_scene(model)), options
     given = scene_at_poses(images, poses, options.point_model())
-    for sentence in given.sentences:
-        console.say(sentence)
+    console.say(*given.sentences)
     if given.calibrated:  # a model that came with parameters is the one of the scene
         return given.scene, options if options.camera_params is None else replace(options, camera_model=None)
     return given.scene, replace(options, camera_model=None, refine_intrinsics=options.refine_intrinsics is not False)

@@ -25,7 +25,7 @@ def synth(
     ] = "holistic",
     cameras: Annotated[
         int, _options.PLAIN.option("Number of cameras.", "--cameras", "-n", min=2, max=MOST, metavar="N")
-    ] = 50,
+    ] = 50,  # derived from groma.scene.synthetic
     noise: Annotated[
         float | None,
         _options.PLAIN.option(

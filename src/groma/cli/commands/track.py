@@ -62,6 +62,7 @@ def track(
         int | None, _options.PLAIN.option("Stop after N frames. Default: all.", min=1, metavar="N")
     ] = None,
     stride: Annotated[int, _options.PLAIN.option("Use every N-th frame.", min=1, metavar="N")] = 1,
+    # derived from TrackOptions
     max_depth: Annotated[float, _options.PLAIN.option("Ignore depths beyond M metres.", min=0.1, metavar="M")] = 6.0,
     depth_scale: Annotated[
         float | None,
@@ -135,8 +136,7 @@ def track(
         files = getattr(frames, "pictures", {})  # of a video there are none
         pictures = {name: files[name] for name in result.scene.images.names if name in files}
         unwritten = result.write(output, f"Track of {_output.subject(sequence)}", force, pictures or None)
-    for sentence in unwritten:
-        console.warn(sentence)
+    console.warn(*unwritten)
     remove_stages(work)
     numbers = result.summary()
     _say(console, numbers)

@@ -22,7 +22,7 @@ def view(
     ] = None,
     port: Annotated[
         int, _options.PLAIN.option("Port, or the next free one; 0: any.", "--port", "-p", min=0, max=65535, metavar="N")
-    ] = 8080,
+    ] = 8080,  # convention: of viser
     live: Annotated[
         bool, _options.PLAIN.option("Follow groma track while it runs: INPUT is its OUT.", "--live")
     ] = False,

@@ -39,8 +39,7 @@ def warmup(
     with console.stages() as progress:
         numbers = warm_up(parts or PARTS, progress, again)
     ran = bool(numbers.pop("run"))
-    for sentence in _sentences(numbers, ran):
-        console.say(sentence)
+    console.say(*_sentences(numbers, ran))
     if numbers["unsaved"]:
         console.warn(f"{counted(numbers['unsaved'], 'functions')} could not be written; is the disk full?")
     _output.write_json(console.json_target, numbers, force)

@@ -3,13 +3,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from groma._counted import counted
 from groma.cli.shared import output as _output
-from groma.cli.shared.measurements import Measured, say_survey
+from groma.cli.shared.input import refuse_idle
+from groma.cli.shared.measurements import PANEL, Measured, say_survey
+from groma.cli.shared.options import PLAIN, RESULTS, Contributions, Force, RollingShutter, Truth
 from groma.errors import InputError, ProblemError
 
 if TYPE_CHECKING:
@@ -26,30 +28,86 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Wanted:
-    """The results requested from ``groma adjust``; None and False: not requested."""
+    """The results requested from ``groma adjust``, one parameter of the command; None and False: not requested."""
 
-    #: Files of the adjusted scene, the page and the covariances.
-    output: Path | None = None
-    page: Path | None = None
-    covariance: Path | None = None
-    #: Gauge of the covariances, and the noise in units of the stated one.
-    gauge: str = "auto"
-    sigma0: float = 1.0
-    #: Diagnose what the data determine; None: up to a number of images.
-    diagnosis: bool | None = None
-    #: Adjust with fewer kinds of landmarks, too, and compare the poses with those of a scene.
-    contributions: bool = False
-    truth: Path | None = None
-    #: Replace existing files.
-    force: bool = False
-    #: Measurements of other instruments, and the file of their protocol.
-    measured: Measured = field(default_factory=Measured)
-    protocol: Path | None = None
-    #: Readout direction of a rolling shutter.
-    rolling_shutter: str | None = None
+    output: Annotated[
+        Path | None,
+        PLAIN.option(
+            "Result: a folder (COLMAP model and structures), a groma archive (.npz) or a BAL file (.txt, .bz2, "
+            ".gz). Without it, only reports are written.",
+            "--output",
+            "-o",
+            metavar="OUT",
+        ),
+    ] = None
+    rolling_shutter: RollingShutter = None
+    page: Annotated[
+        Path | None, RESULTS.option("Also write an HTML page: before and after.", "--report", metavar="FILE")
+    ] = None
+    covariance: Annotated[
+        Path | None,
+        RESULTS.option(
+            "Also write the uncertainty: covariances (.npz) or standard deviations (.json) of images, points, lines, "
+            "planes and directions.",
+            metavar="FILE",
+        ),
+    ] = None
+    covariance_gauge: Annotated[
+        Literal["auto", "inner", "held"],
+        RESULTS.option("Gauge of the covariances: inner, all camera centres; held, the first camera and the scale."),
+    ] = "auto"
+    sigma0: Annotated[
+        float,
+        RESULTS.option(
+            "With --covariance: the measurement noise in units of the stated one (1 pixel unless the scene has "
+            "standard deviations).",
+            metavar="S",
+        ),
+    ] = 1.0
+    diagnosis: Annotated[
+        bool | None, RESULTS.option("Report what the data do not determine. Default: up to 300 images.")
+    ] = None
+    protocol: Annotated[
+        Path | None,
+        PANEL.option(
+            "Also write measurements with residuals, redundancy numbers and tests, as text (adjustment.txt).",
+            metavar="FILE",
+        ),
+    ] = None
+    contributions: Contributions = False
+    truth: Truth = None
+    force: Force = False
+
+    def validate(self) -> None:
+        """Refuse values out of range, and options without effect."""
+        if self.covariance is not None and self.covariance.suffix not in (".npz", ".json"):
+            raise InputError(f"--covariance must end in .npz or .json; got {self.covariance}.")
+        if not 0.0 < self.sigma0 < float("inf"):
+            raise InputError(f"--sigma0 must be positive; got {self.sigma0}.")
+        if self.truth is not None and not self.contributions:
+            raise InputError("--truth is what --contributions compares with. Add --contributions, or leave it out.")
+        refuse_idle(
+            ("--covariance-gauge", self.covariance_gauge != "auto" and self.covariance is None, "with --covariance"),
+            ("--sigma0", self.sigma0 != 1.0 and self.covariance is None, "with --covariance"),
+        )
+
+    @property
+    def given(self) -> dict[str, object]:
+        """Options that need a scene with images as a whole, by name."""
+        return {
+            "--report": self.page, "--covariance": self.covariance, "--protocol": self.protocol,
+            "--contributions": self.contributions, "--diagnosis": self.diagnosis,
+            "--rolling-shutter": self.rolling_shutter,
+        }  # fmt: skip
 
 
-def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wanted: Wanted) -> None:
+#: Of a command that was given none.
+WANTED_NOTHING = Wanted()
+
+
+def adjust_and_write(
+    console: Console, source: Path, options: AdjustOptions, wanted: Wanted, measured: Measured
+) -> None:
     """Adjust the scene in a file, write the requested results and print a summary.
 
     Raises
@@ -69,7 +127,7 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
     true = None if wanted.truth is None else read_scene(wanted.truth)
     console.expect_compilation(_work_of(before, options))
     with compilation_time() as compilation, console.progress() as progress:
-        before, result, survey, motions = _adjusted(before, options, wanted, progress)
+        before, result, survey, motions = _adjusted(before, options, wanted, measured, progress)
     entries = ()
     if wanted.contributions:
         from groma.adjustment.contributions import contributions  # with evaluation, half a second to import
@@ -93,7 +151,7 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
     found, failure = None, None
     if wanted.covariance is not None:
         try:
-            found = result.uncertainty(wanted.gauge, wanted.sigma0)
+            found = result.uncertainty(wanted.covariance_gauge, wanted.sigma0)
             _output.check_output(wanted.covariance, wanted.force)
             write_covariances(wanted.covariance, result.scene, found, wanted.force)
             numbers["uncertainty"] = found.to_dict()
@@ -105,8 +163,7 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
         _write_page(wanted.page, wanted.force, source, before, result, numbers, found)
     _say(console, numbers, compilation)
     say_survey(console, survey or {})
-    for sentence in motions.sentences() if motions else ():
-        console.say(sentence)
+    console.say(*(motions.sentences() if motions else ()))
     for path in (wanted.output, wanted.page, wanted.protocol, wanted.covariance if "uncertainty" in numbers else None):
         if path is not None:
             console.wrote(path)
@@ -140,16 +197,20 @@ def _write_page(
     found: SceneUncertainty | None,
 ) -> None:
     """Write the page, before and after; covariances give standard deviations to what is measured on it."""
-    from groma.viz.report.covariances import covariances_of
+    from groma.viz.report.covariances import LandmarkCovariances, centers_of_images
     from groma.viz.report.page import PageContents, write_report
     from groma.viz.report.survey import survey_card
     from groma.viz.report.tables import contributions_card
 
+    known = None
+    if found is not None:
+        centers = centers_of_images(result.scene, found.centers, result.scene.images.frame_idx)
+        known = LandmarkCovariances(found.gauge, found.points, found.lines, found.planes, centers)
     contents = PageContents(
         warnings=numbers["warnings"],
         diagnosis=numbers["diagnosis"],
         cards=contributions_card(numbers.get("contributions")) + survey_card(numbers.get("survey")),
-        covariances=None if found is None else covariances_of(result.scene, found),
+        covariances=known,
     )
     title = f"Adjustment of {_output.subject(source)}"
     with _output.atomic_output(path, force) as draft:
@@ -157,13 +218,17 @@ def _write_page(
 
 
 def _adjusted(
-    before: Scene, options: AdjustOptions, wanted: Wanted, progress: Callable[[Progress], bool | None]
+    before: Scene,
+    options: AdjustOptions,
+    wanted: Wanted,
+    measured: Measured,
+    progress: Callable[[Progress], bool | None],
 ) -> tuple[Scene, AdjustResult, dict[str, Any] | None, Motions | None]:
     """Return the initial scene, the result, and the numbers of measurements and camera motions."""
     from groma.adjustment.adjust import adjust
 
-    surveyed = bool(wanted.measured) or before.has_survey
-    for option, given in (("--protocol", wanted.protocol), ("--keep-suspects", wanted.measured.keep_suspects or None)):
+    surveyed = bool(measured) or before.has_survey
+    for option, given in (("--protocol", wanted.protocol), ("--keep-suspects", measured.keep_suspects or None)):
         if not surveyed and given is not None:
             raise InputError(
                 f"{option} is of measurements; there are none. Add --positions, --control, --distances or others."
@@ -176,8 +241,8 @@ def _adjusted(
         return before, adjust(before, options, progress), None, None
     from groma.mapping.surveyed import adjust_surveyed  # with what finds noise in images
 
-    survey = wanted.measured.read(None, lambda: before.images.names) if wanted.measured else None
-    found = adjust_surveyed(before, survey, options, progress, wanted.measured.keep_suspects)
+    survey = measured.read(None, lambda: before.images.names) if measured else None
+    found = adjust_surveyed(before, survey, options, progress, measured.keep_suspects)
     return found.surveyed.scene, found.result, found.to_dict() if surveyed else None, found.motions
 
 
@@ -207,9 +272,7 @@ def _say(console: Console, numbers: dict[str, Any], compilation: Compilation) ->
     from groma.cli.shared.sentences import describe_uncertainty, say_adjustment, say_contributions
 
     say_adjustment(console, numbers, numbers["termination_sentence"], compilation)
-    for line in describe_uncertainty(numbers["uncertainty"]) if "uncertainty" in numbers else ():
-        console.say(line)
+    console.say(*(describe_uncertainty(numbers["uncertainty"]) if "uncertainty" in numbers else ()))
     say_contributions(console, numbers.get("contributions", []))
     say_diagnosis(numbers["diagnosis"], console)
-    for sentence in numbers["warnings"]:
-        console.warn(sentence)
+    console.warn(*numbers["warnings"])

@@ -31,16 +31,16 @@ class Console:
             for variable in _THREAD_VARIABLES:
                 os.environ[variable] = str(threads)
 
-    def say(self, text: str = "") -> None:
-        """Print a sentence unless --quiet, wrapped on a terminal."""
-        if not self.quiet:
+    def say(self, *texts: str) -> None:
+        """Print sentences unless --quiet, wrapped on a terminal."""
+        for text in texts if not self.quiet else ():
             text = wrapped(text, terminal_width()) if is_terminal(self._stream) else text
             print(text, file=self._stream, flush=True)
 
-    def detail(self, text: str) -> None:
-        """Print a line with --verbose."""
+    def detail(self, *texts: str) -> None:
+        """Print lines with --verbose."""
         if self.verbose:
-            self.say(text)
+            self.say(*texts)
 
     def table(self, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         """Print an aligned table unless --quiet; nothing if it has no rows."""
@@ -49,9 +49,9 @@ class Console:
             top = [paint(line, "bold", self._stream) for line in top]
             print("\n".join([*top, *lines]), file=self._stream, flush=True)
 
-    def warn(self, text: str) -> None:
-        """Print a warning on standard error unless --quiet."""
-        if not self.quiet:
+    def warn(self, *texts: str) -> None:
+        """Print warnings on standard error unless --quiet."""
+        for text in texts if not self.quiet else ():
             warn(text)
 
     def warn_of_all(self, texts: Sequence[str]) -> None:
@@ -64,8 +64,7 @@ class Console:
             alike.setdefault(re.sub(r"\d+", "0", text), []).append(text)
         for first, *others in alike.values():
             if len(others) < 3:
-                for text in (first, *others):
-                    self.warn(text)
+                self.warn(first, *others)
             else:
                 self.warn(f"{first} The same of {counted(len(others), 'others')}.")
 

@@ -54,8 +54,7 @@ def extend_map(
 
     console.expect_stages(*DESCRIBING, LOCALIZING, *_WITH_POINTS, *following)
     extended = _with_progress(console, made, f"finished photographs are kept in {work}")
-    for sentence in (*warnings, *extended.warnings()):
-        console.warn(sentence)
+    console.warn(*warnings, *extended.warnings())
     return extended
 
 
@@ -84,9 +83,7 @@ def merge_maps(
 
     console.expect_stages(*DESCRIBING, *DESCRIBING, COMPARING, *_WITH_POINTS, *following)
     merged = _with_progress(console, made, "the descriptions of the maps are kept beside them")
-    for sentence in (*warnings, merged.left_out):
-        if sentence:
-            console.warn(sentence)
+    console.warn(*warnings, *filter(None, [merged.left_out]))
     console.say(merged.sentence())
     return merged
 

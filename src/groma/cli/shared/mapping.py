@@ -105,17 +105,13 @@ def say_map(console: Console, result: MapResult, numbers: dict[str, Any], explai
 
     counts = {kind: getattr(result.scene, f"num_{kind}") for kind in KINDS}
     console.table(*fit_table(counts, result.report.inliers))
-    for line in describe_pose_uncertainty(numbers.get("pose_uncertainty")):
-        console.say(line)
-    for line in describe_structure(numbers["num_relations"]):
-        console.say(line)
-    for line in describe_relations(result.report.relations):
-        console.detail(line)
+    console.say(*describe_pose_uncertainty(numbers.get("pose_uncertainty")))
+    console.say(*describe_structure(numbers["num_relations"]))
+    console.detail(*describe_relations(result.report.relations))
     say_contributions(console, numbers.get("contributions", []))
     if explain or console.verbose:
         say_diagnosis(numbers["diagnosis"], console)
     (console.say if explain else console.detail)(result.explanation)
     say_depth(console, numbers.get("depth") or {})
     say_survey(console, numbers.get("survey") or {})
-    for sentence in result.warnings:
-        console.warn(sentence)
+    console.warn(*result.warnings)

@@ -239,8 +239,7 @@ def _sigma(text: str | None, option: str, count: tuple[int, int] = (1, 3)) -> tu
 
 def say_survey(console: Console, numbers: dict[str, Any]) -> None:
     """Print how the scene was placed in its frame, how the measurements fit, and which contradict the rest."""
-    for sentence in numbers.get("notes", ()):
-        console.say(sentence)
+    console.say(*numbers.get("notes", ()))
     shown = [
         f"{kind}s {component:.2f}" for kind, component in numbers.get("variance_components", {}).items() if component
     ]

@@ -110,8 +110,7 @@ def _adjust(
     say_adjustment(console, numbers, sentence, compilation)
     for kind, rmse in numbers["rmse_px"].items() if not console.verbose else ():
         console.say(f"  rms of all {kind}, outliers included: {rmse['before']:.3f} px -> {rmse['after']:.3f} px")
-    for text in result.warnings:
-        console.warn(text)
+    console.warn(*result.warnings)
     console.wrote(output)
     return numbers
 

@@ -56,8 +56,7 @@ def adjust_graph_and_write(
     console.say(f"{costs}, {steps} in {time}. {result.report.termination.sentence}")
     if result.from_motions:
         console.say("It began from poses that follow from the motions alone: they cost less than those of the file.")
-    for sentence in result.warnings:
-        console.warn(sentence)
+    console.warn(*result.warnings)
     if output is not None:
         console.wrote(output)
     else:

@@ -63,12 +63,10 @@ def say_adjustment(
     time = spent(seconds["total"], seconds.get("compilation", 0.0), compilation is not None and compilation.compiled)
     steps = counted(numbers["iterations"], "steps")
     console.say(f"Cost {numbers['initial_cost']:.5g} -> {numbers['final_cost']:.5g}, {steps} in {time}. {sentence}")
-    for line in describe_pose_uncertainty(numbers.get("pose_uncertainty")):
-        console.say(line)
+    console.say(*describe_pose_uncertainty(numbers.get("pose_uncertainty")))
     if not console.verbose:
         return
-    for line in describe_relations(numbers.get("relations") or {}):
-        console.say(line)
+    console.say(*describe_relations(numbers.get("relations") or {}))
     for kind, rmse in numbers.get("rmse_px", {}).items():
         console.say(f"  rms of all {kind}, outliers included: {rmse['before']:.3f} px -> {rmse['after']:.3f} px")
     stages = ", ".join(f"{name} {value:.3f} s" for name, value in seconds.items() if name not in _NO_STAGES)

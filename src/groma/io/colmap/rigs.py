@@ -200,7 +200,7 @@ def _camera(content: dict[str, Any], place: str) -> RigCamera:
     if rotation is not None:
         quaternion = _numbers(rotation, 4, f"{place}, cam_from_rig_rotation")  # w x y z
         length = float(np.linalg.norm(quaternion))
-        if abs(length - 1.0) > 1e-2:
+        if abs(length - 1.0) > 1e-2:  # derived from four numbers of two decimals
             raise FileFormatError(
                 f"{place}: expected a unit quaternion w, x, y, z as cam_from_rig_rotation; its length is {length:g}."
             )

@@ -31,21 +31,29 @@ from groma.io.trajectories import Trajectory, read_trajectory
 #: Default frame rate, 1/s (convention: usual for video).
 RATE = 30.0
 
-#: What to do where no camera is known.
-NO_CAMERA = (
-    "No camera is known for {path}. Pass one (--camera), such as 'fx fy cx cy', or the name of a file with a line of "
-    "COLMAP's cameras.txt, or put it into cameras.txt beside the images."
-)
-
 
 def image_files(folder: Path) -> list[Path]:
     """Return the images of a folder (or of ``images`` or ``rgb`` in it) in order of the numbers in their names."""
-    for place in (folder, folder / "images", folder / "rgb"):
-        if place.is_dir():
-            found = [path for path in place.iterdir() if path.suffix.lower() in IMAGES and path.is_file()]
-            if found:
-                return sorted(found, key=lambda path: natural_key(path.name))
-    return []
+    return next((found for place in (folder, folder / "images", folder / "rgb") if (found := images_in(place))), [])
+
+
+def images_in(folder: Path) -> list[Path]:
+    """Return the images of a folder itself in order of the numbers in their names; none where it is not there."""
+    if not folder.is_dir():
+        return []
+    found = (path for path in folder.iterdir() if path.suffix.lower() in IMAGES and path.is_file())
+    return sorted(found, key=lambda path: natural_key(path.name))
+
+
+def camera_for(place: Path, wishes: Wishes, *folders: Path) -> Calibration:
+    """Return the camera that is passed, or lies in one of the folders; InputError where there is none."""
+    found = wishes.calibration or next((one for one in map(find_calibration, folders) if one is not None), None)
+    if found is None:
+        raise InputError(
+            f"No camera is known for {place}. Pass one (--camera), such as 'fx fy cx cy', or the name of a file with a "
+            "line of COLMAP's cameras.txt, or put it into cameras.txt beside the images."
+        )
+    return found
 
 
 def open_images(folder: Path, wishes: Wishes) -> FileSequence:
@@ -53,9 +61,7 @@ def open_images(folder: Path, wishes: Wishes) -> FileSequence:
     warnings: list[str] = []
     kind = wishes.selection.kind_of("mono")
     images = image_files(folder)
-    calibration = wishes.calibration or find_calibration(folder) or find_calibration(images[0].parent)
-    if calibration is None:
-        raise InputError(NO_CAMERA.format(path=folder))
+    calibration = camera_for(folder, wishes, folder, images[0].parent)
     entries = [Entry(time, path) for time, path in zip(times_of(folder, images), images, strict=True)]
     return simple_sequence(kind, wishes.selection.of(entries, warnings), calibration, reference_of(folder), warnings)
 
@@ -63,10 +69,7 @@ def open_images(folder: Path, wishes: Wishes) -> FileSequence:
 def open_video(path: Path, wishes: Wishes) -> VideoSequence:
     """Open a video file; see :func:`groma.io.sequences.open_sequence`."""
     wishes.selection.kind_of("mono")
-    calibration = wishes.calibration or find_calibration(path.parent)
-    if calibration is None:
-        raise InputError(NO_CAMERA.format(path=path))
-    return VideoSequence(path, calibration, wishes.selection)
+    return VideoSequence(path, camera_for(path, wishes, path.parent), wishes.selection)
 
 
 class VideoSequence:

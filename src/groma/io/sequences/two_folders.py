@@ -14,14 +14,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from groma._counted import counted, natural_key
+from groma._counted import counted
 from groma.bounded.images import decoded
-from groma.bounded.names import IMAGES
 from groma.errors import FileFormatError, InputError
 from groma.io.sequences import tum_rgbd
-from groma.io.sequences._calibration import find_calibration
 from groma.io.sequences._reader import Entry, FileSequence, Preparation, simple_sequence
-from groma.io.sequences.images import NO_CAMERA, reference_of, times_of
+from groma.io.sequences.images import camera_for, images_in, reference_of, times_of
 from groma.io.sequences.layouts import Wishes
 
 #: Folders of colour, those that others are named after first (belongs to the format).
@@ -34,16 +32,14 @@ DEPTH_SCALE = 1000.0
 
 def is_two_folders(folder: Path) -> bool:
     """Whether a folder has this layout."""
-    return bool(_images(folder / DEPTH)) and any(_images(folder / name) for name in COLOR)
+    return bool(images_in(folder / DEPTH)) and any(images_in(folder / name) for name in COLOR)
 
 
 def open_two_folders(folder: Path, wishes: Wishes) -> FileSequence:
     """Open a folder; see :func:`groma.io.sequences.open_sequence`."""
-    colors = next(found for name in COLOR if (found := _images(folder / name)))
-    depths = _images(folder / DEPTH)
-    calibration = wishes.calibration or find_calibration(folder) or find_calibration(colors[0].parent)
-    if calibration is None:
-        raise InputError(NO_CAMERA.format(path=folder))
+    colors = next(found for name in COLOR if (found := images_in(folder / name)))
+    depths = images_in(folder / DEPTH)
+    calibration = camera_for(folder, wishes, folder, colors[0].parent)
     warnings: list[str] = []
     kind = wishes.selection.kind_of("rgbd")
     pairs = _pairs(colors, depths)
@@ -63,13 +59,6 @@ def open_two_folders(folder: Path, wishes: Wishes) -> FileSequence:
     return simple_sequence(
         kind, wishes.selection.of(entries, warnings), calibration, reference_of(folder), warnings, preparation
     )
-
-
-def _images(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        return []
-    found = (path for path in folder.iterdir() if path.suffix.lower() in IMAGES and path.is_file())
-    return sorted(found, key=lambda path: natural_key(path.name))
 
 
 def _are_seconds(images: list[Path]) -> bool:

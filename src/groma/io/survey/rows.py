@@ -177,7 +177,7 @@ def read_measured_poses(path: str | os.PathLike[str]) -> PosesFile:
     for where, words in _rows(path, "file of poses", expected, (8, 10, 29, 44), 1):
         numbers = _numbers(words[1:], where, expected)
         length = float(np.linalg.norm(numbers[3:7]))
-        if abs(length - 1.0) > 1e-3:
+        if abs(length - 1.0) > 1e-3:  # derived from four numbers of three decimals
             raise FileFormatError(f"{where}: expected a unit quaternion qx qy qz qw; its length is {length:.4g}.")
         if words[0] in poses:
             raise FileFormatError(f"{where}: {shown(words[0])} has a pose already. Leave one of the two out.")

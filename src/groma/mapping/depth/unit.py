@@ -57,7 +57,7 @@ def common_unit(ratio: FloatArray, image_idx: IntArray, known: bool) -> tuple[fl
     level = np.log(ratio[told])
     unit, warnings = float(np.exp(np.median(level))), []
     own = np.array([np.median(level[image_idx[told] == i]) for i in np.unique(image_idx[told])])
-    scatter = SIGMA_OF_MEDIAN * float(np.median(np.abs(own - np.median(own))))
+    scatter = _spread(own)
     if scatter > UNITS.different:
         warnings.append(
             f"The depth maps do not agree on a unit: their scales differ by {np.expm1(scatter):.0%} from map to map. "

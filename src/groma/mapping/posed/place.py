@@ -85,7 +85,7 @@ def place_photographs(
     options: PointModelOptions,
     refine_poses: bool = True,
     refine_intrinsics: bool = False,
-    max_iterations: int = 50,
+    max_iterations: int = 50,  # derived from MapOptions
     say: Say = lambda doing, done, total: None,
 ) -> PlacedPhotographs:
     """Find points and better poses of photographs.

@@ -22,7 +22,7 @@ from functools import partial
 
 import numpy as np
 
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assembly_options import SURFACE_SIGMA_PX
 from groma.adjustment.terms.relations import ANGLES, lengths_per_pixel
 from groma.errors import InputError
@@ -288,27 +288,13 @@ def _landmarks(scene: Scene, options: StructureOptions, noise: LandmarkNoise | N
     )
 
 
-def _only(planes: PlaneSet, kept: np.ndarray) -> tuple[PlaneSet, IntArray]:
+def _only(planes: PlaneSet, kept: BoolArray) -> tuple[PlaneSet, IntArray]:
     """Return some of the planes, and the new number of each old one, -1 where it is gone."""
-    rows = np.flatnonzero(kept)
-    new = np.full(len(planes), -1)
-    new[rows] = np.arange(len(rows))
-    shown = np.append(new, -1)
-    chosen = PlaneSet(
-        planes.planes[rows],
-        planes.covariance[rows],
-        planes.support[rows],
-        planes.share[rows],
-        planes.band[rows],
-        planes.log10_false_alarms[rows],
-        shown[planes.point_label],
-        shown[planes.segment_label],
-        [planes.places[row] for row in rows],
-    )
-    return chosen, new
+    new = np.where(kept, np.cumsum(kept) - 1, -1)
+    return planes.take(np.flatnonzero(kept), new), new
 
 
-def _only_directions(directions: DirectionSet, kept: np.ndarray) -> tuple[DirectionSet, IntArray]:
+def _only_directions(directions: DirectionSet, kept: BoolArray) -> tuple[DirectionSet, IntArray]:
     """Return some of the directions, and the new number of each old one, -1 where it is gone."""
     new = np.where(kept, np.cumsum(kept) - 1, -1)
     right = new[directions.orthogonal]

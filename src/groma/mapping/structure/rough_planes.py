@@ -217,19 +217,12 @@ def _spread(turned: FloatArray, noise: FloatArray, expected: float) -> float:
 
 def _as_one(planes: PlaneSet, group: list[int]) -> PlaneSet:
     """The first plane of a group with all that the group has; what other planes have is theirs."""
-    label = np.ones(len(planes) + 1, np.int64)
-    label[group], label[-1] = 0, -1
-    first = group[:1]
-    return PlaneSet(
-        planes.planes[first],
-        planes.covariance[first],
-        planes.support[group].sum(keepdims=True),
-        planes.share[first],
-        planes.band[first],
-        planes.log10_false_alarms[first],
-        label[planes.point_label],
-        label[planes.segment_label],
-        [np.concatenate([planes.places[b] for b in group])],
+    new = np.ones(len(planes), np.int64)
+    new[group] = 0
+    return replace(
+        planes.take(np.array(group[:1]), new),
+        support=planes.support[group].sum(keepdims=True),
+        places=[np.concatenate([planes.places[b] for b in group])],
     )
 
 
@@ -245,18 +238,8 @@ def _with_wholes(planes: PlaneSet, groups: list[list[int]], wholes: list[PlaneSe
         support[first], places[first] = whole.support[0], whole.places[0]
     rows = np.unique(into)
     new = np.searchsorted(rows, into)
-    label = np.append(new, -1)
-    return new, PlaneSet(
-        plane[rows],
-        covariance[rows],
-        support[rows],
-        planes.share[rows],
-        planes.band[rows],
-        planes.log10_false_alarms[rows],
-        label[planes.point_label],
-        label[planes.segment_label],
-        [places[row] for row in rows],
-    )
+    joined = replace(planes, planes=plane, covariance=covariance, support=support, places=places)
+    return new, joined.take(rows, new)
 
 
 def _features(marks: Landmarks, points: Pairs, lines: Pairs, plane: int) -> tuple[FloatArray, FloatArray]:

@@ -22,10 +22,10 @@ from groma.solver.options import SolverOptions
 from groma.solver.report import SolveReport
 from groma.solver.solve import solve
 from groma.tracking.frame.camera import TrackCamera, back, into
-from groma.tracking.frame.measurements import LineMeasurements, PlaneMeasurements, PointMeasurements
+from groma.tracking.frame.measurements import LineMeasurements, PointMeasurements
 from groma.tracking.map.landmarks import ALIVE
 from groma.tracking.map.lines import line_ends
-from groma.tracking.map.map_scene import TRACKING, SeenLines, SeenPlanes, SeenPoints, map_scene
+from groma.tracking.map.map_scene import TRACKING, Seen, map_scene, stacked
 from groma.tracking.map.relations import find_relations
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.pose.estimate import GATE
@@ -193,17 +193,11 @@ def job_of(
     min_views: int = 2,
 ) -> AdjustmentJob | None:
     """Prepare the adjustment of some keyframes and all that at least two, or ``min_views``, of them see."""
-    living = [track_map.living_measurements(keyframe) for keyframe in keyframes]
+    measured, pose = stacked(track_map, keyframes)
+    points, lines = measured.points, measured.lines
     rows = {}
     for kind, table in (("points", track_map.points), ("lines", track_map.lines)):
         rows[kind] = [np.flatnonzero(table.state[getattr(k.measured, kind).index] == ALIVE) for k in keyframes]
-    points = PointMeasurements.stack([m.points for m in living])
-    lines = LineMeasurements.stack([m.lines for m in living])
-    planes = PlaneMeasurements.stack([m.planes for m in living])
-    pose = {
-        kind: np.repeat(np.arange(len(keyframes)), [len(getattr(m, kind)) for m in living])
-        for kind in ("points", "lines", "planes")
-    }
     in_table = {kind: np.concatenate(rows[kind]) if rows[kind] else np.zeros(0, np.int64) for kind in rows}
     # Points seen once, or by no free keyframe, do not constrain poses.
     free = ~held
@@ -211,7 +205,7 @@ def job_of(
     moving = np.zeros(len(track_map.points), dtype=bool)
     moving[points.index[free[pose["points"]]]] = True
     keep = often[points.index] & moving[points.index]
-    points, point_pose, point_rows = points.take(keep), pose["points"][keep], in_table["points"][keep]
+    point_rows, points, point_pose = in_table["points"][keep], points.take(keep), pose["points"][keep]
     moving = np.zeros(len(track_map.lines), dtype=bool)
     moving[lines.index[free[pose["lines"]]]] = True
     known = np.bincount(lines.index, minlength=len(track_map.lines)) >= 2
@@ -219,25 +213,25 @@ def job_of(
     keep = moving[lines.index] & known[lines.index]
     lines, line_pose, line_rows = lines.take(keep), pose["lines"][keep], in_table["lines"][keep]
 
-    point_ids, point_local = np.unique(points.index, return_inverse=True)
-    line_ids, line_local = np.unique(lines.index, return_inverse=True)
+    seen_points, seen_lines = Seen.of(points, point_pose), Seen.of(lines, line_pose)
+    point_ids, line_ids = seen_points.ids, seen_lines.ids
     tied = np.concatenate([track_map.points.plane[point_ids], track_map.lines.plane[line_ids]])
-    plane_ids = np.union1d(planes.index, np.intersect1d(tied, np.flatnonzero(track_map.planes.of_landmarks)))
+    plane_ids = np.union1d(measured.planes.index, np.intersect1d(tied, np.flatnonzero(track_map.planes.of_landmarks)))
     scene = map_scene(
         camera,
-        track_map.view,
+        track_map,
         np.array([k.pose for k in keyframes]),
         [str(k.index) for k in keyframes],
-        SeenPoints(point_ids, replace(points, index=point_local), point_pose),
-        SeenLines(line_ids, replace(lines, index=line_local), line_pose),
-        SeenPlanes(plane_ids, replace(planes, index=np.searchsorted(plane_ids, planes.index)), pose["planes"]),
+        seen_points,
+        seen_lines,
+        Seen.of(measured.planes, pose["planes"], plane_ids),
         relations=find_relations(track_map, point_ids, line_ids, plane_ids) if relations else Relations(),
     )
     coordinates = held
     if held.sum() == 1 and len(scene.relations):
         # Distances between landmarks cost less in a smaller map: unless it is metric, its scale is held too.
         coordinates = first_camera_gauge(scene, first=int(held.argmax()))
-    if not (len(points) or len(lines) or len(planes)):
+    if not (len(points) or len(lines) or len(measured.planes)):
         return None
     return AdjustmentJob(
         camera, keyframes, held, point_ids, line_ids, plane_ids, scene, replace(options, held_frames=coordinates),

@@ -145,10 +145,10 @@ def joined_map(track_map: TrackMap, other: TrackMap, here_from_there: FloatArray
         mine, theirs = getattr(out, kind), getattr(other, kind)
         start[kind] = len(mine)
         rows = mine.extend(len(theirs))
-        for name in theirs._columns:
+        for name in theirs.columns:
             getattr(mine, name)[rows] = getattr(theirs, name)
         for name in ("keyframe", "first_keyframe"):
-            if name in theirs._columns:
+            if name in theirs.columns:
                 getattr(mine, name)[rows] = _shifted(getattr(theirs, name), shift)
     points, lines, planes = (slice(start[kind], None) for kind in ("points", "lines", "planes"))
     out.points.xyz[points] = into(pose, scale * other.points.xyz)

@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from groma._typing import FloatArray, IntArray
 from groma.tracking.frame.camera import TrackCamera
@@ -22,6 +23,15 @@ from groma.tracking.options import TrackOptions
 def match_features(first: Features, second: Features, max_bits: int) -> tuple[IntArray, IntArray]:
     """Match features by nearest descriptors within a number of bits; return the rows of both."""
     return pair_anywhere(first.descriptor, second.descriptor, max_bits)
+
+
+def linked_to_points(features: Features, tracks: PointTracks, reach: float) -> Features:
+    """Return the features, those within a reach (pixels) of points that are followed linked to them."""
+    if not len(features.pixel) or not len(tracks):
+        return features
+    distance, nearest = KDTree(features.pixel).query(tracks.pixel, distance_upper_bound=reach)
+    rows = np.flatnonzero(np.isfinite(distance))
+    return features.linked(np.asarray(nearest)[rows], tracks.index[rows])
 
 
 def points_of_features(

@@ -6,7 +6,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from groma._typing import FloatArray, IntArray
 from groma.features.point_tracks import spread
@@ -17,7 +16,7 @@ from groma.tracking.frame.camera import TrackCamera, back, into
 from groma.tracking.frame.features import Features, FrameFeatures
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
 from groma.tracking.gates import LineGates
-from groma.tracking.map.feature_points import place_by_motion
+from groma.tracking.map.feature_points import linked_to_points, place_by_motion
 from groma.tracking.map.landmarks import ALIVE, PENDING
 from groma.tracking.map.lines import FollowedSegments, assign, expected_segments, line_ends
 from groma.tracking.map.planes import add_planes, assign_planes, grow
@@ -135,11 +134,7 @@ def _add_points(
         points.keyframe[tracks.index], points.pixel[tracks.index], points.misses[tracks.index] = index, tracks.pixel, 0
     if options.points:
         # Described features near tracked points belong to them.
-        if len(features.pixel) and len(tracks):
-            found = KDTree(features.pixel).query(tracks.pixel, distance_upper_bound=gates.same_feature)
-            distance, nearest = np.asarray(found[0]), np.asarray(found[1])
-            rows = np.flatnonzero(np.isfinite(distance))
-            features = features.linked(nearest[rows], tracks.index[rows])
+        features = linked_to_points(features, tracks, gates.same_feature)
         depthless = data.frame.depth is None and data.frame.right is None
         if depthless and track_map.keyframes and points.alive[tracks.index].sum() < gates.few * options.num_points:
             # After a wide step few points are tracked, but many features match.
@@ -334,14 +329,12 @@ def _add_planes(track_map: TrackMap, data: FrameFeatures, pose: FloatArray) -> P
     seen = data.planes
     assert seen is not None
     gates = data.options.gates.planes
-    index, rows = assign_planes(track_map.planes, seen, pose, gates.angle, gates.distance, gates)
+    index, rows = assign_planes(track_map.planes, seen, pose, gates)
     for k, row in zip(index, rows, strict=True):
         grow(track_map.planes, int(k), back(pose, seen.places_of(row)), float(seen.support[row]), gates)
     rest = np.setdiff1d(np.arange(len(seen)), rows)
     # No new plane near an existing one that did not agree well enough.
-    _, ambiguous = assign_planes(
-        track_map.planes, seen, pose, gates.wider * gates.angle, gates.wider * gates.distance, gates
-    )
+    _, ambiguous = assign_planes(track_map.planes, seen, pose, gates, gates.wider)
     rest = np.setdiff1d(rest, ambiguous)
     index = np.concatenate([index, add_planes(track_map.planes, seen, rest, pose, gates)])
     rows = np.concatenate([rows, rest])

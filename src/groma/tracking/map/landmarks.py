@@ -7,27 +7,34 @@ after it was culled. Rows are never reused, so an index always means the same la
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 
 PENDING, ALIVE, DEAD = 0, 1, 2
+#: Samples of the extent kept for each plane (cost: time).
+SAMPLES_KEPT = 64
+
+
+def _column(*shape: int, dtype: type = np.float64, fill: float = 0.0) -> Any:
+    """Declare a column: the shape of one row, the type of its numbers, and their first value."""
+    return shape, dtype, fill
 
 
 class _Growing:
-    """Arrays of one length that double when they are full."""
+    """Arrays of one length that double when they are full; every annotated attribute is a column."""
 
-    _columns: dict[str, tuple[tuple[int, ...], type, float]]
+    columns: ClassVar[dict[str, tuple[tuple[int, ...], type, float]]]
     state: np.ndarray
+
+    def __init_subclass__(cls) -> None:
+        cls.columns = {name: getattr(cls, name) for name in cls.__annotations__}
 
     def __init__(self) -> None:
         self.count = 0
-        self._arrays = {
-            name: np.full((64, *shape), fill, dtype) for name, (shape, dtype, fill) in self._columns.items()
-        }
+        self._arrays = {name: np.full((64, *shape), fill, dtype) for name, (shape, dtype, fill) in self.columns.items()}
         self._show_rows()
 
     def __len__(self) -> int:
@@ -41,7 +48,7 @@ class _Growing:
     def extend(self, count: int) -> IntArray:
         """Add ``count`` rows and return their indices."""
         need = self.count + count
-        for name, (shape, dtype, fill) in self._columns.items():
+        for name, (shape, dtype, fill) in self.columns.items():
             array = self._arrays[name]
             if need > len(array):
                 larger = np.full((max(need, 2 * len(array)), *shape), fill, dtype)
@@ -68,49 +75,28 @@ class _Growing:
 class PointTable(_Growing):
     """Points: place, where their patch is kept, how often they were missed, and the plane they lie on."""
 
-    _columns = {  # noqa: RUF012
-        "xyz": ((3,), np.float64, 0.0),
-        "state": ((), np.int8, PENDING),
-        "keyframe": ((), np.int64, -1),
-        "pixel": ((2,), np.float64, 0.0),
-        "first_keyframe": ((), np.int64, -1),
-        "first_pixel": ((2,), np.float64, 0.0),
-        "misses": ((), np.int32, 0),
-        "plane": ((), np.int64, -1),
-        "plane_sigma": ((), np.float64, 0.0),
-    }
-    xyz: FloatArray
-    state: np.ndarray
-    keyframe: IntArray
-    pixel: FloatArray
-    first_keyframe: IntArray
-    first_pixel: FloatArray
-    misses: IntArray
-    plane: IntArray
-    plane_sigma: FloatArray
+    xyz: FloatArray = _column(3)
+    state: np.ndarray = _column(dtype=np.int8, fill=PENDING)
+    keyframe: IntArray = _column(dtype=np.int64, fill=-1)
+    pixel: FloatArray = _column(2)
+    first_keyframe: IntArray = _column(dtype=np.int64, fill=-1)
+    first_pixel: FloatArray = _column(2)
+    misses: IntArray = _column(dtype=np.int32)
+    plane: IntArray = _column(dtype=np.int64, fill=-1)
+    plane_sigma: FloatArray = _column()
 
 
 class LineTable(_Growing):
     """Lines: place, the part that was seen, the strength of their edge in the image, and their plane."""
 
-    _columns = {  # noqa: RUF012
-        "plucker": ((6,), np.float64, 0.0),
-        "segment": ((2, 3), np.float64, 0.0),
-        "state": ((), np.int8, PENDING),
-        "strength": ((), np.float64, 0.0),
-        "first_keyframe": ((), np.int64, -1),
-        "first_ends": ((4,), np.float64, 0.0),
-        "plane": ((), np.int64, -1),
-        "plane_sigma": ((), np.float64, 0.0),
-    }
-    plucker: FloatArray
-    segment: FloatArray
-    state: np.ndarray
-    strength: FloatArray
-    first_keyframe: IntArray
-    first_ends: FloatArray
-    plane: IntArray
-    plane_sigma: FloatArray
+    plucker: FloatArray = _column(6)
+    segment: FloatArray = _column(2, 3)
+    state: np.ndarray = _column(dtype=np.int8, fill=PENDING)
+    strength: FloatArray = _column()
+    first_keyframe: IntArray = _column(dtype=np.int64, fill=-1)
+    first_ends: FloatArray = _column(4)
+    plane: IntArray = _column(dtype=np.int64, fill=-1)
+    plane_sigma: FloatArray = _column()
 
 
 class PlaneTable(_Growing):
@@ -119,33 +105,14 @@ class PlaneTable(_Growing):
     Those found in depth images count in how many; those found in points and lines of the map, in none.
     """
 
-    #: Samples of the extent kept for each plane.
-    samples_kept = 64
-    _columns = {  # noqa: RUF012
-        "hesse": ((4,), np.float64, 0.0),
-        "state": ((), np.int8, PENDING),
-        "samples": ((samples_kept, 3), np.float64, np.nan),
-        "support": ((), np.float64, 0.0),
-        "found": ((), np.int32, 0),
-        "merged_into": ((), np.int64, -1),
-    }
-    hesse: FloatArray
-    state: np.ndarray
-    samples: FloatArray
-    support: FloatArray
-    found: IntArray
-    merged_into: IntArray
+    hesse: FloatArray = _column(4)
+    state: np.ndarray = _column(dtype=np.int8, fill=PENDING)
+    samples: FloatArray = _column(SAMPLES_KEPT, 3, fill=np.nan)
+    support: FloatArray = _column()
+    found: IntArray = _column(dtype=np.int32)
+    merged_into: IntArray = _column(dtype=np.int64, fill=-1)
 
     @property
     def of_landmarks(self) -> BoolArray:
         """Which planes with a place were found in points and lines, not in depth images."""
         return self.alive & (self.found == 0)
-
-
-@dataclass(frozen=True)
-class MapView:
-    """The landmarks that measurements refer to; arrays are read, not kept."""
-
-    points: PointTable
-    lines: LineTable
-    planes: PlaneTable

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -26,8 +27,14 @@ from groma.scene import (
 )
 from groma.scene.table import Table
 from groma.tracking.frame.camera import PINHOLE, TrackCamera
-from groma.tracking.frame.measurements import DEPTH_BASELINE, LineMeasurements, PlaneMeasurements, PointMeasurements
-from groma.tracking.map.landmarks import MapView
+from groma.tracking.frame.measurements import (
+    DEPTH_BASELINE,
+    LineMeasurements,
+    Measurements,
+    PlaneMeasurements,
+    PointMeasurements,
+)
+from groma.tracking.map.track_map import Keyframe, TrackMap
 
 #: How tracking assembles problems. Points are near and well known, and keep to plain steps.
 TRACKING = AssemblyOptions(
@@ -40,41 +47,42 @@ TRACKING = AssemblyOptions(
 )
 
 
-@dataclass(frozen=True)
-class SeenPoints:
-    """Measurements of points by several images: those of landmark ``ids[k]`` have the index k."""
-
-    ids: IntArray
-    table: PointMeasurements
-    image: IntArray
+_Table = TypeVar("_Table", PointMeasurements, LineMeasurements, PlaneMeasurements)
 
 
 @dataclass(frozen=True)
-class SeenLines:
-    """Measurements of lines by several images."""
+class Seen(Generic[_Table]):
+    """Measurements of landmarks of one kind by several images: those of landmark ``ids[k]`` have the index k."""
 
     ids: IntArray
-    table: LineMeasurements
+    table: _Table
     image: IntArray
 
+    @classmethod
+    def of(cls, table: _Table, image: IntArray, ids: IntArray | None = None) -> Seen[_Table]:
+        """Number the landmarks of measurements; ``ids``, ascending, by default those that are measured."""
+        ids = np.unique(table.index) if ids is None else ids
+        return cls(ids, replace(table, index=np.searchsorted(ids, table.index)), image)
 
-@dataclass(frozen=True)
-class SeenPlanes:
-    """Measurements of planes by several images."""
 
-    ids: IntArray
-    table: PlaneMeasurements
-    image: IntArray
+def stacked(track_map: TrackMap, keyframes: list[Keyframe]) -> tuple[Measurements, dict[str, IntArray]]:
+    """Return what keyframes measure of living landmarks, one below the other, and by kind the keyframe of each row."""
+    parts = [track_map.living_measurements(keyframe) for keyframe in keyframes]
+    kinds = {"points": PointMeasurements, "lines": LineMeasurements, "planes": PlaneMeasurements}
+    tables = {kind: [getattr(part, kind) for part in parts] for kind in kinds}
+    row = np.arange(len(parts))
+    image: dict[str, IntArray] = {kind: np.repeat(row, [len(table) for table in tables[kind]]) for kind in kinds}
+    return Measurements(**{kind: table.stack(tables[kind]) for kind, table in kinds.items()}), image
 
 
 def map_scene(
     camera: TrackCamera,
-    view: MapView,
+    track_map: TrackMap,
     poses: FloatArray,
     names: list[str],
-    points: SeenPoints,
-    lines: SeenLines,
-    planes: SeenPlanes,
+    points: Seen[PointMeasurements],
+    lines: Seen[LineMeasurements],
+    planes: Seen[PlaneMeasurements],
     **more: Table | Relations,
 ) -> Scene:
     """Return the scene of some images, their landmarks, and everything measured of them.
@@ -83,8 +91,8 @@ def map_scene(
     ----------
     camera
         Of all images.
-    view
-        The landmarks of the map; those of the scene keep their numbers there, plus one, as identifiers.
+    track_map
+        Holds the landmarks; those of the scene keep their numbers there, plus one, as identifiers.
     poses : (F, 7)
         cam_from_world.
     names
@@ -101,9 +109,9 @@ def map_scene(
         names,
         np.zeros(len(names), int),
         poses,
-        points=Points(points.ids + 1, view.points.xyz[points.ids], np.full((count, 3), 128), np.zeros(count)),
-        lines=Lines(lines.ids + 1, view.lines.plucker[lines.ids], view.lines.segment[lines.ids]),
-        planes=Planes(planes.ids + 1, view.planes.hesse[planes.ids]),
+        points=Points(points.ids + 1, track_map.points.xyz[points.ids], np.full((count, 3), 128), np.zeros(count)),
+        lines=Lines(lines.ids + 1, track_map.lines.plucker[lines.ids], track_map.lines.segment[lines.ids]),
+        planes=Planes(planes.ids + 1, track_map.planes.hesse[planes.ids]),
         **_point_tables(camera, points.table, points.image),
         **_line_tables(lines.table, lines.image),
         plane_observations=PlaneObservations(

@@ -10,7 +10,7 @@ from groma._typing import FloatArray, IntArray
 from groma.tracking.frame.camera import back, planes_back, planes_into
 from groma.tracking.frame.planes import FramePlanes
 from groma.tracking.gates import DEFAULT, PlaneGates
-from groma.tracking.map.landmarks import ALIVE, DEAD, PlaneTable
+from groma.tracking.map.landmarks import ALIVE, DEAD, SAMPLES_KEPT, PlaneTable
 
 
 @loop
@@ -38,12 +38,7 @@ def _refuse_apart(samples, alive, places, rows, begin, limits, score):
 
 
 def assign_planes(
-    planes: PlaneTable,
-    seen: FramePlanes,
-    pose: FloatArray,
-    max_angle: float,
-    max_distance: float,
-    gates: PlaneGates = DEFAULT.planes,
+    planes: PlaneTable, seen: FramePlanes, pose: FloatArray, gates: PlaneGates = DEFAULT.planes, wider: float = 1.0
 ) -> tuple[IntArray, IntArray]:
     """Pair planes of the map with planes of a frame by angle, distance and overlap.
 
@@ -54,6 +49,7 @@ def assign_planes(
     (k,), (k,) int
         Planes of the map, and rows of ``seen``; each at most once.
     """
+    max_angle, max_distance = wider * gates.angle, wider * gates.distance
     alive = np.flatnonzero(planes.alive)
     none = np.zeros(0, np.int64)
     if not len(alive) or not len(seen):
@@ -94,7 +90,7 @@ def grow(planes: PlaneTable, index: int, places: FloatArray, support: float, gat
         cells -= cells.min(axis=0, initial=0)
         most = cells.max(axis=0, initial=0) + 1
         rows = np.unique((cells[:, 0] * most[1] + cells[:, 1]) * most[2] + cells[:, 2], return_index=True)[1]
-        if len(rows) <= planes.samples_kept:
+        if len(rows) <= SAMPLES_KEPT:
             break
         size *= gates.box_growth
     planes.samples[index] = np.nan

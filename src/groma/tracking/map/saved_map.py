@@ -12,7 +12,6 @@ import math
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from groma._typing import IntArray
 from groma.errors import InputError
@@ -22,6 +21,7 @@ from groma.scene import Scene
 from groma.tracking.frame.camera import PINHOLE, TrackCamera, back, into
 from groma.tracking.frame.features import FrameFeatures
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements
+from groma.tracking.map.feature_points import linked_to_points
 from groma.tracking.map.keyframes import measure_points
 from groma.tracking.map.landmarks import ALIVE
 from groma.tracking.map.planes import grow
@@ -121,12 +121,7 @@ def _add_keyframe(track_map: TrackMap, scene: Scene, image: int, data: FrameFeat
     tracks = PointTracks(seen.point_idx[rows], seen.pixel[rows])
     tracks = tracks.take(np.unique(tracks.index, return_index=True)[1])
     points = measure_points(data, tracks, options, track_map, pose, camera)
-    features = data.features
-    if len(features.pixel) and len(tracks):
-        near = KDTree(features.pixel).query(tracks.pixel, distance_upper_bound=options.gates.points.same_feature)
-        distance, nearest = np.asarray(near[0]), np.asarray(near[1])
-        found = np.isfinite(distance)
-        features = features.linked(nearest[found], tracks.index[found])
+    features = linked_to_points(data.features, tracks, options.gates.points.same_feature)
     measured = Measurements(points, _lines(track_map, scene, image, data), _planes(track_map, scene, image, data))
     depth = float(np.median(into(pose, track_map.points.xyz[tracks.index])[:, 2])) if len(tracks) else 1.0
     track_map.keyframes.append(

@@ -12,7 +12,7 @@ from groma._typing import FloatArray, IntArray
 from groma.geometry import se3
 from groma.tracking.frame.features import Features
 from groma.tracking.frame.measurements import Measurements
-from groma.tracking.map.landmarks import ALIVE, DEAD, LineTable, MapView, PlaneTable, PointTable
+from groma.tracking.map.landmarks import ALIVE, DEAD, LineTable, PlaneTable, PointTable
 
 
 def in_unit(motion: FloatArray, unit: float) -> FloatArray:
@@ -66,11 +66,6 @@ class TrackMap:
     reference: int = -1
     #: Keyframes that must not be dropped: they join maps.
     pinned: set[int] = field(default_factory=set)
-
-    @property
-    def view(self) -> MapView:
-        """The landmarks, as the estimate of a pose takes them."""
-        return MapView(self.points, self.lines, self.planes)
 
     @property
     def last(self) -> Keyframe:

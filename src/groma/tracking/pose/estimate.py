@@ -29,7 +29,7 @@ from groma.factors.losses import Cauchy, GemanMcClure, Loss
 from groma.gates import NORMAL
 from groma.tracking.frame.camera import TrackCamera, into
 from groma.tracking.frame.measurements import DEPTH_BASELINE, Measurements
-from groma.tracking.map.landmarks import MapView
+from groma.tracking.map.track_map import TrackMap
 
 #: A residual beyond this many standard deviations is an outlier.
 GATE = NORMAL.coordinate
@@ -63,7 +63,7 @@ class PoseEstimate:
 
 def estimate_pose(
     camera: TrackCamera,
-    view: MapView,
+    view: TrackMap,
     measured: Measurements,
     predicted: FloatArray,
     prior_sigma: FloatArray,
@@ -97,7 +97,7 @@ def estimate_pose(
 
 def rough_pose(
     camera: TrackCamera,
-    view: MapView,
+    view: TrackMap,
     measured: Measurements,
     predicted: FloatArray,
     prior_sigma: FloatArray,
@@ -108,7 +108,7 @@ def rough_pose(
 
 
 def _seen(
-    camera: TrackCamera, view: MapView, measured: Measurements, predicted: FloatArray, prior_sigma: FloatArray
+    camera: TrackCamera, view: TrackMap, measured: Measurements, predicted: FloatArray, prior_sigma: FloatArray
 ) -> SeenMap:
     """Return what a frame measures of the map beside where that is."""
     points, lines, planes, K = measured.points, measured.lines, measured.planes, camera.params
@@ -132,7 +132,7 @@ def weak_directions(information: FloatArray, depth: float) -> tuple[str, ...]:
     return tuple(_NAMES[int(np.abs(vectors[:, k]).argmax())] for k in range(6) if values[k] < 1.0)
 
 
-def _median_depth(view: MapView, measured: Measurements, pose: FloatArray) -> float:
+def _median_depth(view: TrackMap, measured: Measurements, pose: FloatArray) -> float:
     places = [view.points.xyz[measured.points.index], view.lines.segment[measured.lines.index].mean(axis=1)]
     depths = into(pose, np.concatenate(places))[:, 2]
     depths = depths[depths > 0]

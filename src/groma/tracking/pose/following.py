@@ -94,7 +94,7 @@ def follow_frame(
     if len(measured) + 2 * len(lines) + 3 * len(planes) < gates.verification.min_followed:
         return None, Followed.nothing()
     with watch("pose"):
-        estimate = estimate_pose(camera, track_map.view, Measurements(measured, lines, planes), predicted, prior_sigma)
+        estimate = estimate_pose(camera, track_map, Measurements(measured, lines, planes), predicted, prior_sigma)
     # Followed are points that agree, and points without a place; lines likewise.
     keep = np.ones(len(tracks), dtype=bool)
     keep[np.flatnonzero(alive)[~estimate.points]] = False

@@ -304,7 +304,7 @@ class PoseSearch:
             planes = self._planes_at(pose)
             if len(pairs) + len(line_table) + len(planes) < 3:  # derived from three matches that fix a pose
                 return None
-            view = replace(track_map.view, points=temporary)
+            view = replace(track_map, points=temporary)
             around = (camera, view, Measurements(table, line_table, planes), self.predicted, self.prior_sigma, pose)
             if factor == gates.rounds[-1]:
                 estimate = estimate_pose(*around, LOSSES[-1:])
@@ -390,6 +390,5 @@ def match_planes(track_map: TrackMap, data: FrameFeatures, pose: FloatArray) -> 
     if data.planes is None:
         return PlaneMeasurements.empty()
     gates = data.options.gates.planes
-    angle, distance = gates.wider * gates.angle, gates.wider * gates.distance
-    index, rows = assign_planes(track_map.planes, data.planes, pose, angle, distance, gates)
+    index, rows = assign_planes(track_map.planes, data.planes, pose, gates, gates.wider)
     return PlaneMeasurements(index, data.planes.plane[rows], data.planes.sqrt_information[rows])

@@ -150,6 +150,7 @@ class PoseVerification:
 
         def nats(pose: FloatArray) -> float:
             shift, turn = apart(pose, predicted)
+            # derived from half the squares of three numbers each, whose sigmas are equal
             return 1.5 * float((shift / np.linalg.norm(sigma[:3])) ** 2 + (turn / np.linalg.norm(sigma[3:])) ** 2)
 
         others = poses_left_open(track_map, self.camera, data, self._chosen(track_map), found, sigma)

@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -15,35 +14,6 @@ from groma.bounded.arrays import Header, opened_arrays
 from groma.errors import FileFormatError, InputError
 from groma.io.reading import existing, reading
 from groma.scene import Scene
-
-
-class Uncertainty(Protocol):
-    """Interface to the uncertainty of a scene (:func:`groma.uncertainty`)."""
-
-    @property
-    def gauge(self) -> str:
-        """Gauge of the covariances."""
-        ...
-
-    @property
-    def points(self) -> FloatArray:
-        """(P, 3, 3)"""
-        ...
-
-    @property
-    def lines(self) -> FloatArray:
-        """(L, 6, 6)"""
-        ...
-
-    @property
-    def planes(self) -> FloatArray:
-        """(K, 4, 4)"""
-        ...
-
-    @property
-    def centers(self) -> FloatArray:
-        """(N, 3, 3)"""
-        ...
 
 
 @dataclass(frozen=True)
@@ -70,13 +40,6 @@ class LandmarkCovariances:
         return LandmarkCovariances(
             self.gauge, self.points, line @ self.lines @ line.T, plane @ self.planes @ plane.T, self.centers
         )
-
-
-def covariances_of(scene: Scene, found: Uncertainty) -> LandmarkCovariances:
-    """Return the covariances of a scene from the result of :func:`groma.uncertainty`."""
-    return LandmarkCovariances(
-        found.gauge, found.points, found.lines, found.planes, _of_images(scene, found.centers, scene.images.frame_idx)
-    )
 
 
 def read_covariances(path: str | os.PathLike[str], scene: Scene) -> LandmarkCovariances:
@@ -116,7 +79,7 @@ def read_covariances(path: str | os.PathLike[str], scene: Scene) -> LandmarkCova
             of("points", 3, scene.points.ids),
             of("lines", 6, scene.lines.ids),
             of("planes", 4, scene.planes.ids),
-            _of_images(scene, centers, np.array([row.get(name, -1) for name in scene.images.names], np.int64)),
+            centers_of_images(scene, centers, np.array([row.get(name, -1) for name in scene.images.names], np.int64)),
         )
     known = [np.isfinite(one).any() for one in (found.points, found.lines, found.planes, found.centers)]
     if not any(known):
@@ -138,8 +101,8 @@ def _matched(covariances: FloatArray, ids: IntArray, wanted: IntArray) -> FloatA
     return found
 
 
-def _of_images(scene: Scene, centers: FloatArray, frames: IntArray) -> FloatArray:
-    """Return the covariances of camera centres; NaN for rigs, whose covariances are those of the rig frames."""
+def centers_of_images(scene: Scene, centers: FloatArray, frames: IntArray) -> FloatArray:
+    """Return the covariances of camera centres from those of frames; NaN for rigs, of which these are no cameras."""
     found = np.full((scene.num_images, 3, 3), np.nan)
     known = (frames >= 0) & (frames < len(centers))
     if scene.has_trivial_rigs:

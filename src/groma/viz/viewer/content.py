@@ -17,14 +17,14 @@ from groma.geometry import quaternion
 from groma.io.drawn import openings
 from groma.scene import Scene
 from groma.scene.line_intervals import line_pieces
-from groma.scene.local_frame import up_of
 from groma.scene.similarity import Similarity
 from groma.viz import colours as _colours
 from groma.viz.colours import Colours
-from groma.viz.drawable import drawable, junctions
+from groma.viz.drawable import Drawable, drawable, junctions
+from groma.viz.framing import OPENING, horizontal, starting_view
 from groma.viz.statistics import LineStatistics, line_statistics
 
-#: Half the size of the scene in the frame of the viewer.
+#: Half the size of the scene in the frame of the viewer: half the height of the initial picture, where it is centred.
 REACH = 5.0
 #: Colour modes of lines.
 LINE_MODES = ("direction", "shared direction", "length", "reprojection error", "number of images", "confidence")
@@ -72,9 +72,8 @@ class ViewContent:
     #: (N,) vertical opening, radians, and width over height.
     camera_openings: FloatArray
     camera_aspects: FloatArray
-    #: Initial viewpoint and target.
+    #: Initial viewpoint; it looks at the origin.
     start_position: FloatArray
-    start_target: FloatArray
 
     def line_colours(self, mode: str) -> LineColours:
         """Return the colours of the lines by one of ``LINE_MODES``."""
@@ -125,7 +124,7 @@ def view_content(scene: Scene) -> ViewContent:
     """Compute what the viewer draws of a scene."""
     shown = drawable(scene)
     pieces, line = line_pieces(scene)
-    frame, position, target = _frame(scene)
+    frame, position = _frame(shown)
     order = np.random.default_rng(0).permutation(scene.num_points)
     errors = shown.point_errors[order]
     known = errors[np.isfinite(errors)]
@@ -159,7 +158,6 @@ def view_content(scene: Scene) -> ViewContent:
         camera_openings=opening,
         camera_aspects=aspect,
         start_position=position,
-        start_target=target,
     )
 
 
@@ -209,30 +207,12 @@ def _by_number(values: FloatArray, unit: str, logarithmic: bool = False, from_ze
     return LineColours(_colours.ramp(share), f"{low:.3g}{unit}", f"{high:.3g}{unit}")
 
 
-def _frame(scene: Scene) -> tuple[Similarity, FloatArray, FloatArray]:
-    """Return ``view_from_world``, and the initial viewpoint and target in the viewer."""
-    landmarks = np.concatenate([scene.points.xyz, scene.lines.segments.reshape(-1, 3)])
-    centers = scene.cam_centers_in_world
-    places = landmarks if len(landmarks) else centers
-    middle: FloatArray = np.asarray(np.median(places, axis=0), np.float64) if len(places) else np.zeros(3)
-    # The size is robust to points far away.
-    reach = np.percentile(np.linalg.norm(places - middle, axis=1), 85) if len(places) else 1.0
-    if len(centers):
-        reach = max(reach, float(np.median(np.linalg.norm(centers - middle, axis=1))))
-    scale = REACH / reach if reach > 0 else 1.0
-    up = up_of(scene)
-    away = centers.mean(axis=0) - middle if len(centers) else np.array([1.0, 1.0, 0.0])
-    away = away - (away @ up) * up
-    if np.linalg.norm(away) < 0.15 * reach:
-        # Cameras around the scene: look from the side of the first one.
-        away = centers[0] - middle if len(centers) else np.array([1.0, 1.0, 0.0])
-        away = away - (away @ up) * up
-    if np.linalg.norm(away) < 1e-9 * max(reach, 1e-300):
-        away = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-    first: FloatArray = np.asarray(away / np.linalg.norm(away), np.float64)
-    rotation: FloatArray = np.stack([first, np.cross(up, first), up]).astype(np.float64)
-    shift: FloatArray = -scale * (rotation @ middle)
-    frame = Similarity(scale, rotation, shift)
-    # From behind the cameras, from the side and from above.
-    back = np.array([np.cos(0.45) * np.cos(0.4), np.sin(0.45) * np.cos(0.4), np.sin(0.4)])
-    return frame, 2.4 * REACH * back, np.zeros(3)
+def _frame(shown: Drawable) -> tuple[Similarity, FloatArray]:
+    """Return ``view_from_world``, and the initial viewpoint in the viewer, which looks at its origin."""
+    view = starting_view(shown, np.zeros(3))
+    away = REACH / OPENING[1]
+    scale = away / view.distance
+    rotation = np.stack([*horizontal(view.up), view.up])
+    turn, rise = view.azimuth, view.elevation
+    back = np.array([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)])
+    return Similarity(scale, rotation, -scale * (rotation @ view.pivot)), away * back

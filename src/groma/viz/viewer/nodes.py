@@ -12,6 +12,7 @@ import numpy as np
 from groma._typing import BoolArray
 from groma.scene.patches import patch_groups
 from groma.viz import colours as _colours
+from groma.viz import framing
 from groma.viz.pack import thin
 from groma.viz.pictures import ImageFiles, image_file, read_picture, warn_of_names_outside
 from groma.viz.viewer import arrays as _view_arrays
@@ -28,7 +29,7 @@ MAX_CAMERAS = 400
 #: Longer side of the photographs in the cameras, pixels.
 THUMBNAIL = 256
 #: Vertical opening of the page, radians.
-OPENING = float(np.deg2rad(50.0))
+OPENING = float(2.0 * np.arctan(framing.OPENING[1]))
 #: A click this near to a line hits it, pixels.
 CLICK_PIXELS = 8.0
 
@@ -73,7 +74,7 @@ class SceneView:
         server.scene.set_up_direction("+z")
         server.initial_camera.fov = OPENING
         server.initial_camera.position = content.start_position
-        server.initial_camera.look_at = content.start_target
+        server.initial_camera.look_at = np.zeros(3)
         with server.atomic():
             self._add_panel()
             self._add_cameras()
@@ -324,7 +325,7 @@ class SceneView:
         self.shown["cameras"].value = image < 0
         with event.client.atomic():
             if image < 0:
-                camera.position, camera.look_at = self.content.start_position, self.content.start_target
+                camera.position, camera.look_at = self.content.start_position, np.zeros(3)
                 camera.up_direction, camera.fov = np.array([0.0, 0.0, 1.0]), OPENING
             else:
                 camera.wxyz = self.content.camera_wxyz[image]
