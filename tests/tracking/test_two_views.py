@@ -133,3 +133,24 @@ def test_points_at_infinity_begin_far_away_in_front():
     found = intersected(CAMERA, one, two, SECOND)
     np.testing.assert_allclose(found[:5], places[:5], rtol=1e-6)
     assert (found[5:, 2] > 100.0 * np.linalg.norm(SECOND[4:])).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_points_whose_depth_is_not_known_yet_do_not_count_as_outliers(seed):
+    """The noise is a third of the parallax: many points are beyond infinity by it, behind a camera that says so."""
+    rng = np.random.default_rng(seed)
+    places = box(rng, 400) + np.array([0.0, 0.0, 20.0])
+    pixels = seen(places, [IDENTITY, pose([0.01, 0.0, 0.0], [0.1, 0.0, 0.0]), SECOND], rng)
+    costs = np.array([one.cost for one in judged(begun(pixels), pixels)])
+    # Six coordinates a point, three of which its place takes up; an outlier in all views would count 18.
+    assert costs.min() < 1.2 * 0.5 * 3 * len(places)
+    assert costs.max() < 1.5 * costs.min()
+
+
+def test_both_ways_are_proposed():
+    """A motion the other way sees its points beyond infinity; with little parallax points do not tell."""
+    rng = np.random.default_rng(7)
+    pixels = seen(box(rng), [IDENTITY, SECOND], rng)
+    found = motions(CAMERA, pixels[0], pixels[1], GATES)
+    np.testing.assert_array_equal(found[0], [*found[1][:4], *-found[1][4:]])
+    assert min(error(motion, SECOND)[1] for motion in found[:2]) < 0.1

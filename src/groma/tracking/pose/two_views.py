@@ -68,6 +68,9 @@ class Candidate:
 def motions(camera: TrackCamera, one: FloatArray, two: FloatArray, gates: StartGates) -> list[FloatArray]:
     """Return the motions, cam_from_world (7,) with a translation of length one, that two views may show.
 
+    With little parallax it is left open whether points are in front of the camera or, for a motion the other way,
+    beyond infinity; so both ways are returned.
+
     Parameters
     ----------
     camera
@@ -90,7 +93,9 @@ def motions(camera: TrackCamera, one: FloatArray, two: FloatArray, gates: StartG
             if np.mean(on_plane @ np.asarray(normal).ravel() > 0.0) > 0.5 and np.linalg.norm(t) > 0.0:
                 found.append((np.asarray(R), np.asarray(t)))
     return [
-        np.concatenate([quaternion.from_matrix(R.astype(np.float64)), t.ravel() / np.linalg.norm(t)]) for R, t in found
+        np.concatenate([quaternion.from_matrix(R.astype(np.float64)), sign * t.ravel() / np.linalg.norm(t)])
+        for R, t in found
+        for sign in (1.0, -1.0)
     ]
 
 
@@ -104,7 +109,10 @@ def intersected(camera: TrackCamera, one: FloatArray, two: FloatArray, pose: Flo
 
 
 def adjusted(camera: TrackCamera, candidate: Candidate, pixels: FloatArray, sigma: float, gate: float) -> Candidate:
-    """Adjust a candidate to its views.
+    """Adjust a candidate to its views; its points begin, and are judged, where they agree best with its motion.
+
+    Where the parallax is below the noise, points end behind a camera or far from where they agree, and a point there
+    counts as an outlier in every view: a few of them would tell more than all others.
 
     Parameters
     ----------
@@ -118,6 +126,7 @@ def adjusted(camera: TrackCamera, candidate: Candidate, pixels: FloatArray, sigm
         A pixel beyond so many standard deviations disagrees.
     """
     views, count = len(pixels), len(candidate.places)
+    places, _ = _placed(camera, candidate.poses, candidate.places, pixels, gate * sigma)
     image, point = np.repeat(np.arange(views), count), np.tile(np.arange(count), views)
     cameras = Cameras.of([1], [PINHOLE], [camera.params], [camera.width, camera.height])
     scene = Scene.from_images(
@@ -125,7 +134,7 @@ def adjusted(camera: TrackCamera, candidate: Candidate, pixels: FloatArray, sigm
         [str(view) for view in range(views)],
         np.zeros(views, int),
         candidate.poses,
-        points=Points(np.arange(count) + 1, candidate.places, np.full((count, 3), 128, np.uint8), np.zeros(count)),
+        points=Points(np.arange(count) + 1, places, np.full((count, 3), 128, np.uint8), np.zeros(count)),
         point_observations=PointObservations.numbered(image, point, pixels.reshape(-1, 2), np.full(len(image), sigma)),
     )
     solution = solve(assemble(scene, _ASSEMBLY).problem, _SOLVER)
@@ -135,16 +144,36 @@ def adjusted(camera: TrackCamera, candidate: Candidate, pixels: FloatArray, sigm
     poses = se3.compose(poses, np.tile(se3.inverse(poses[:1]), (views, 1)))
     scale = float(np.median(np.abs(places[:, 2])))
     poses[:, 4:] /= scale
-    places = places / scale
-    squared = np.array([_squared(camera, p, places, seen) for p, seen in zip(poses, pixels, strict=True)]) / sigma**2
-    cost = 0.5 * float(np.minimum(squared, gate**2).sum())
-    return Candidate(poses, places, cost, np.asarray((squared < gate**2).all(axis=0)))
+    places, squared = _placed(camera, poses, places / scale, pixels, gate * sigma)
+    cost = 0.5 * float(np.minimum(squared / sigma**2, gate**2).sum())
+    return Candidate(poses, places, cost, np.asarray((squared < (gate * sigma) ** 2).all(axis=0)))
+
+
+def _placed(
+    camera: TrackCamera, poses: FloatArray, places: FloatArray, pixels: FloatArray, max_error: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return points (N, 3) where they were or where two rays meet, whichever agrees best, and squared errors (V, N).
+
+    Errors are in pixels, counted up to the largest that agrees.
+    """
+    others = [
+        intersected(camera, pixels[0], seen, pose)
+        for pose, seen in zip(poses[1:], pixels[1:], strict=True)
+        if pose[4:].any()
+    ]
+    proposed = np.array([places, *others])
+    squared = np.array(
+        [[_squared(camera, pose, at, seen) for pose, seen in zip(poses, pixels, strict=True)] for at in proposed]
+    )
+    best = np.minimum(squared, max_error**2).sum(axis=1).argmin(axis=0)
+    points = np.arange(len(places))
+    return proposed[best, points], squared[best, :, points].T
 
 
 def continued(
     camera: TrackCamera, candidate: Candidate, pixels: FloatArray, sigma: float, gates: StartGates
 ) -> Candidate:
-    """Return a candidate with the pose of one more view: from where it shows the candidate's points, or the last one.
+    """Return a candidate with the pose of a third view: from where it shows the candidate's points, or the last one.
 
     Points too far away to tell a position are left out; their numbers would spoil a closed form.
     """
@@ -158,7 +187,7 @@ def continued(
         ).cam_from_world
         poses += [] if found is None else [found]
     costs = [np.minimum(_squared(camera, pose, candidate.places, pixels), max_error**2).sum() for pose in poses]
-    return replace(candidate, poses=np.concatenate([candidate.poses, poses[int(np.argmin(costs))][None]]))
+    return replace(candidate, poses=np.concatenate([candidate.poses[:2], poses[int(np.argmin(costs))][None]]))
 
 
 def _squared(camera: TrackCamera, pose: FloatArray, places: FloatArray, pixels: FloatArray) -> FloatArray:
