@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The motion between two views of one camera: all candidates of a plane, and what a third view says of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -154,3 +156,26 @@ def test_both_ways_are_proposed():
     found = motions(CAMERA, pixels[0], pixels[1], GATES)
     np.testing.assert_array_equal(found[0], [*found[1][:4], *-found[1][4:]])
     assert min(error(motion, SECOND)[1] for motion in found[:2]) < 0.1
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_points_that_err_alike_are_few_witnesses(shared):
+    """Errors of a pixel, of each point alone or of all in a fifth of the image."""
+    rng = np.random.default_rng(8)
+    pixels = seen(box(rng, 400), [IDENTITY, SECOND, THIRD], rng, sigma=0.02 if shared else 0.5)
+    if shared:
+        fifth = (pixels[0] / (CAMERA.width / 5)).astype(int)
+        pixels[2] += rng.normal(0.0, 0.5, (5, 5, 2))[fifth[:, 0], fifth[:, 1]]
+    best = min(judged(begun(pixels), pixels), key=lambda one: one.cost)
+    # Sums over 48 cells scatter by a fifth; the places and poses take up some of what points err alike.
+    assert best.witnesses < 100 if shared else best.witnesses > 300
+
+
+def test_how_far_behind_depends_on_the_witnesses():
+    places = np.ones((400, 3))
+    right, wrong = (
+        Candidate(np.stack([IDENTITY, motion]), places, cost, np.ones(400, bool), 400.0)
+        for motion, cost in ((SECOND, 110.0), (THIRD, 100.0))
+    )
+    assert len(likely([right, wrong], GATES)) == 1  # 19 nats
+    assert len(likely([right, replace(wrong, witnesses=40.0)], GATES)) == 2  # 1.9

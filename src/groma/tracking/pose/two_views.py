@@ -8,19 +8,23 @@ are kept as candidates; each is adjusted with the points in all views so far, un
 .. math:: c = \tfrac12 \sum \min(\|r\|^2 / \sigma^2,\, g^2),
 
 where a pixel that disagrees, and a point behind a camera, counts as an outlier at the gate g. The true noise of points
-that were followed is not known, and what one point errs in several views is much the same; so N points tell about two
+that were followed is not known, and what one point errs in several views is much the same; so n points tell about two
 candidates
 
-.. math:: \tfrac{N}{2} \ln \frac{c_1}{c_2}
+.. math:: \tfrac{n}{2} \ln \frac{c_1}{c_2}
 
-nats, the ratio of their likelihoods at the noise that suits each best. A candidate is ruled out when another one is
-better by ``max_behind``.
+nats, the ratio of their likelihoods at the noise that suits each best. A candidate is ruled out when that is odds of
+1 in 100. But calibration, rolling shutter and the motion itself err alike for neighbours: points of one cell of the
+image are not as many witnesses. Sums of residuals over cells tell, in every frame anew, how many they are: with
+independent errors the square of a sum is the sum of the squares, on average, and n is the number of points over the
+ratio of the two.
 
 Reference: O. Faugeras, F. Lustman, *Motion and structure from motion in a piecewise planar environment*, 1988.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -36,6 +40,7 @@ from groma.scene import Cameras, PointObservations, Points, Scene
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 from groma.tracking.frame.camera import PINHOLE, TrackCamera, into
+from groma.tracking.frame.rectification import cells_of
 from groma.tracking.gates import StartGates
 from groma.tracking.map.map_scene import TRACKING
 
@@ -56,6 +61,8 @@ class Candidate:
     cost: float = np.inf
     #: (N,) which points agree with all views.
     agrees: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
+    #: How many points with independent errors would tell as much.
+    witnesses: float = 0.0
 
     def parallax(self) -> FloatArray:
         """(N,) angle between the rays of the first and of the last view, radians."""
@@ -146,7 +153,17 @@ def adjusted(camera: TrackCamera, candidate: Candidate, pixels: FloatArray, sigm
     poses[:, 4:] /= scale
     places, squared = _placed(camera, poses, places / scale, pixels, gate * sigma)
     cost = 0.5 * float(np.minimum(squared / sigma**2, gate**2).sum())
-    return Candidate(poses, places, cost, np.asarray((squared < (gate * sigma) ** 2).all(axis=0)))
+    agrees = np.asarray((squared < (gate * sigma) ** 2).all(axis=0))
+    return Candidate(poses, places, cost, agrees, _witnesses(camera, poses, places[agrees], pixels[:, agrees]))
+
+
+def _witnesses(camera: TrackCamera, poses: FloatArray, places: FloatArray, pixels: FloatArray) -> float:
+    """Return how many points with independent errors would tell as much as these; see the formula above."""
+    away = np.array([camera.project(into(p, places)) - seen for p, seen in zip(poses, pixels, strict=True)])
+    cell = np.unique(cells_of(camera, pixels[0]), return_inverse=True)[1].ravel()
+    sums = np.zeros((cell.max(initial=-1) + 1, away.shape[0], 2))
+    np.add.at(sums, cell, away.transpose(1, 0, 2))
+    return len(places) / max(1.0, float((sums**2).sum() / max((away**2).sum(), 1e-300)))
 
 
 def _placed(
@@ -200,7 +217,7 @@ def likely(candidates: list[Candidate], gates: StartGates) -> list[Candidate]:
     """Return the candidates that are not ruled out, the best first, each motion once."""
     kept: list[Candidate] = []
     for candidate in sorted(candidates, key=lambda one: one.cost):
-        if kept and _behind(candidate, kept[0], gates.least_cost) > gates.max_behind:
+        if kept and _behind(candidate, kept[0], gates.least_cost) > -math.log(NORMAL.false_alarm):
             break
         if not any(_same(candidate.poses[-1], other.poses[-1], gates) for other in kept):
             kept.append(candidate)
@@ -209,8 +226,8 @@ def likely(candidates: list[Candidate], gates: StartGates) -> list[Candidate]:
 
 def _behind(candidate: Candidate, best: Candidate, least_cost: float) -> float:
     """By how many nats a candidate is less likely than another; see the formula above."""
-    count = len(candidate.places)
-    return 0.5 * count * float(np.log((candidate.cost + least_cost * count) / (best.cost + least_cost * count)))
+    least = least_cost * len(candidate.places)
+    return 0.5 * best.witnesses * float(np.log((candidate.cost + least) / (best.cost + least)))
 
 
 def _same(one: FloatArray, two: FloatArray, gates: StartGates) -> bool:
