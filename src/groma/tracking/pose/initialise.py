@@ -16,7 +16,6 @@ from scipy.spatial import KDTree
 
 from groma._typing import FloatArray
 from groma.features.point_tracks import follow
-from groma.gates import NORMAL
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.features import FrameFeatures
 from groma.tracking.map.keyframes import Followed, add_keyframe
@@ -26,7 +25,7 @@ from groma.tracking.map.points import PointTracks
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.map.triangulation import triangulate
 from groma.tracking.options import TrackOptions
-from groma.tracking.pose.two_views import IDENTITY, Candidate, adjusted, continued, intersected, likely, motions
+from groma.tracking.pose.two_views import IDENTITY, Candidate, likely, proposed, proposed_by_ends, with_third
 
 
 class Initialiser:
@@ -81,36 +80,17 @@ class Initialiser:
     def _propose(self) -> None:
         """Find the motions that the first and the present frame allow; the next frames will judge them."""
         one, two = self._views
-        self._candidates = self._proposed(np.stack([one, two]))
+        self._candidates = proposed(self._camera, np.stack([one, two]), self._options.point_sigma_px, self._gates)
         if self._candidates:
             self._views = [one, two, two.copy()]
 
-    def _proposed(self, views: FloatArray) -> list[Candidate]:
-        """Return the motions that two views (2, N, 2) allow, adjusted to them."""
-        camera, (one, two) = self._camera, views
-        begun = [
-            Candidate(np.stack([IDENTITY, pose]), intersected(camera, one, two, pose))
-            for pose in motions(camera, one, two, self._gates)
-        ]
-        return [self._adjusted(candidate, views) for candidate in begun]
-
-    def _adjusted(self, candidate: Candidate, views: FloatArray) -> Candidate:
-        return adjusted(self._camera, candidate, views, self._options.point_sigma_px, NORMAL.coordinate)
-
-    def _with_third(self, candidate: Candidate, views: FloatArray) -> Candidate:
-        """Return a candidate of the first two views adjusted to all three."""
-        third = continued(self._camera, candidate, views[2], self._options.point_sigma_px, self._gates)
-        return self._adjusted(third, views)
-
     def _judge(self, data: FrameFeatures) -> FloatArray | None:
         """Adjust all candidates to the three views; return the poses of the one that is left and good."""
-        gates, views = self._gates, np.stack(self._views)
-        left = likely([self._with_third(candidate, views) for candidate in self._candidates], gates)
+        gates, seen = self._gates, (np.stack(self._views), self._options.point_sigma_px, self._gates)
+        left = likely([with_third(self._camera, candidate, *seen) for candidate in self._candidates], gates)
         if self._is_known(left):
             # The right motion may not have been proposed when the parallax was less.
-            order = [0, 2, 1]
-            anew = [self._with_third(one, views[order]) for one in self._proposed(views[order[:2]])]
-            left = likely([*left, *(replace(one, poses=one.poses[order]) for one in anew)], gates)
+            left = likely([*left, *proposed_by_ends(self._camera, *seen)], gates)
         best = left[0]
         if best.agrees.sum() < max(gates.min_points, gates.min_inliers * len(best.agrees)):
             return self._restart(data)

@@ -207,6 +207,32 @@ def continued(
     return replace(candidate, poses=np.concatenate([candidate.poses[:2], poses[int(np.argmin(costs))][None]]))
 
 
+def proposed(camera: TrackCamera, pixels: FloatArray, sigma: float, gates: StartGates) -> list[Candidate]:
+    """Return the motions that two views (2, N, 2) allow, adjusted to them."""
+    one, two = pixels
+    begun = [
+        Candidate(np.stack([IDENTITY, pose]), intersected(camera, one, two, pose))
+        for pose in motions(camera, one, two, gates)
+    ]
+    return [adjusted(camera, candidate, pixels, sigma, NORMAL.coordinate) for candidate in begun]
+
+
+def with_third(
+    camera: TrackCamera, candidate: Candidate, pixels: FloatArray, sigma: float, gates: StartGates
+) -> Candidate:
+    """Return a candidate of the first two of three views (3, N, 2), or of all, adjusted to all."""
+    third = continued(camera, candidate, pixels[2], sigma, gates)
+    return adjusted(camera, third, pixels, sigma, NORMAL.coordinate)
+
+
+def proposed_by_ends(camera: TrackCamera, pixels: FloatArray, sigma: float, gates: StartGates) -> list[Candidate]:
+    """Return the motions that the first and the last of three views (3, N, 2) allow, adjusted to all."""
+    order = [0, 2, 1]
+    found = proposed(camera, pixels[order[:2]], sigma, gates)
+    found = [with_third(camera, candidate, pixels[order], sigma, gates) for candidate in found]
+    return [replace(candidate, poses=candidate.poses[order]) for candidate in found]
+
+
 def _squared(camera: TrackCamera, pose: FloatArray, places: FloatArray, pixels: FloatArray) -> FloatArray:
     """(N,) squared distances of points from their pixels; infinite behind the camera."""
     away = camera.project(into(pose, places)) - pixels
@@ -217,17 +243,18 @@ def likely(candidates: list[Candidate], gates: StartGates) -> list[Candidate]:
     """Return the candidates that are not ruled out, the best first, each motion once."""
     kept: list[Candidate] = []
     for candidate in sorted(candidates, key=lambda one: one.cost):
-        if kept and _behind(candidate, kept[0], gates.least_cost) > -math.log(NORMAL.false_alarm):
+        if kept and behind(candidate, kept[0], gates):
             break
         if not any(_same(candidate.poses[-1], other.poses[-1], gates) for other in kept):
             kept.append(candidate)
     return kept
 
 
-def _behind(candidate: Candidate, best: Candidate, least_cost: float) -> float:
-    """By how many nats a candidate is less likely than another; see the formula above."""
-    least = least_cost * len(candidate.places)
-    return 0.5 * best.witnesses * float(np.log((candidate.cost + least) / (best.cost + least)))
+def behind(candidate: Candidate, best: Candidate, gates: StartGates) -> bool:
+    """Whether a candidate is ruled out by another one; see the formula above."""
+    least = gates.least_cost * len(candidate.places)
+    nats = 0.5 * best.witnesses * math.log((candidate.cost + least) / (best.cost + least))
+    return nats > -math.log(NORMAL.false_alarm)
 
 
 def _same(one: FloatArray, two: FloatArray, gates: StartGates) -> bool:
