@@ -145,6 +145,14 @@ def test_what_a_step_hides_is_put_back():
     assert problem.calls.count("refuse") == 2
 
 
+def test_what_a_stretched_step_hides_is_put_back():
+    """The step is good; tried at a greater length its only factor cannot be evaluated any more, and costs nothing."""
+    problem = Curve(cost=lambda x: 0.5 * x * x + 1.0 if x > 0.0 else 0.0, hidden=lambda x: int(x <= 0.0))
+    problem.at = lambda x, at=problem.at: replace(at(x), gain_ratio=2.0)
+    run(problem, max_iterations=1)
+    assert problem.calls[2:4] == ["try", "stretch"] and 0.0 < problem.here.x < 1.0
+
+
 def test_singular_systems_raise_the_damping_until_it_is_exhausted():
     problem = Curve()
     problem.try_step = lambda: problem.here.without_step()

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The motion between two views of one camera: all candidates of a plane, and what a third view says of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -133,3 +135,47 @@ def test_points_at_infinity_begin_far_away_in_front():
     found = intersected(CAMERA, one, two, SECOND)
     np.testing.assert_allclose(found[:5], places[:5], rtol=1e-6)
     assert (found[5:, 2] > 100.0 * np.linalg.norm(SECOND[4:])).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_points_whose_depth_is_not_known_yet_do_not_count_as_outliers(seed):
+    """The noise is a third of the parallax: many points are beyond infinity by it, behind a camera that says so."""
+    rng = np.random.default_rng(seed)
+    places = box(rng, 400) + np.array([0.0, 0.0, 20.0])
+    pixels = seen(places, [IDENTITY, pose([0.01, 0.0, 0.0], [0.1, 0.0, 0.0]), SECOND], rng)
+    costs = np.array([one.cost for one in judged(begun(pixels), pixels)])
+    # Six coordinates a point, three of which its place takes up; an outlier in all views would count 18.
+    assert costs.min() < 1.2 * 0.5 * 3 * len(places)
+    assert costs.max() < 1.5 * costs.min()
+
+
+def test_both_ways_are_proposed():
+    """A motion the other way sees its points beyond infinity; with little parallax points do not tell."""
+    rng = np.random.default_rng(7)
+    pixels = seen(box(rng), [IDENTITY, SECOND], rng)
+    found = motions(CAMERA, pixels[0], pixels[1], GATES)
+    np.testing.assert_array_equal(found[0], [*found[1][:4], *-found[1][4:]])
+    assert min(error(motion, SECOND)[1] for motion in found[:2]) < 0.1
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_points_that_err_alike_are_few_witnesses(shared):
+    """Errors of a pixel, of each point alone or of all in a fifth of the image."""
+    rng = np.random.default_rng(8)
+    pixels = seen(box(rng, 400), [IDENTITY, SECOND, THIRD], rng, sigma=0.02 if shared else 0.5)
+    if shared:
+        fifth = (pixels[0] / (CAMERA.width / 5)).astype(int)
+        pixels[2] += rng.normal(0.0, 0.5, (5, 5, 2))[fifth[:, 0], fifth[:, 1]]
+    best = min(judged(begun(pixels), pixels), key=lambda one: one.cost)
+    # Sums over 48 cells scatter by a fifth; the places and poses take up some of what points err alike.
+    assert best.witnesses < 100 if shared else best.witnesses > 300
+
+
+def test_how_far_behind_depends_on_the_witnesses():
+    places = np.ones((400, 3))
+    right, wrong = (
+        Candidate(np.stack([IDENTITY, motion]), places, cost, np.ones(400, bool), 400.0)
+        for motion, cost in ((SECOND, 110.0), (THIRD, 100.0))
+    )
+    assert len(likely([right, wrong], GATES)) == 1  # 19 nats
+    assert len(likely([right, replace(wrong, witnesses=40.0)], GATES)) == 2  # 1.9

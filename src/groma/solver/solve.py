@@ -185,7 +185,7 @@ def _improved(problem: DampedProblem[T], trial: T, best: T, share: float) -> tup
         return (rescued, True) if rescued.lowers(best, share) else (trial, False)
     if trial.gain_ratio > STRETCH.longer:
         longer = problem.stretch(trial, stretch_factor(trial.gain_ratio))
-        trial = longer if longer.cost < trial.cost else trial
+        trial = longer if longer.lowers(trial, share) else trial
     return problem.refine(trial), True
 
 

@@ -21,6 +21,7 @@ from groma.tracking.backend.depth_calibration import depths_that_do_not_fit
 from groma.tracking.backend.focal_length import focal_length_that_does_not_fit
 from groma.tracking.backend.mapper import Mapper, Present
 from groma.tracking.backend.plane_outcome import PlaneOutcome
+from groma.tracking.backend.rival_motions import motion_that_does_not_fit
 from groma.tracking.backend.submaps import Joint, Places, Submap, best_joint
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.rectification import RightTurn
@@ -133,6 +134,12 @@ class Ending:
             told = self.attempt(
                 "whether the focal length fits",
                 lambda: focal_length_that_does_not_fit(mapper.map, mapper.camera, gates.rectification), [], changes=(),
+            )  # fmt: skip
+        elif not mapper.metric:
+            told = self.attempt(
+                "whether another motion fits",
+                lambda: motion_that_does_not_fit(mapper.map, mapper.camera, gates, mapper.options.point_sigma_px),
+                [], changes=(),
             )  # fmt: skip
         elif not told and mapper.map.living():
             told = self.attempt(

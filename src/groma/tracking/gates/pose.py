@@ -31,7 +31,6 @@ class StartGates:
     min_points: int = gate(60, "points", "points followed and placed", "chosen on rendered rooms")
     min_inliers: float = gate(0.6, "share", "share of the points in front of both cameras", "chosen on rendered rooms")
     depth_sigma: float = gate(0.15, "share", "median deviation of the first depths", "convention: depths are known")
-    max_behind: float = gate(10.0, "nats", "by which another motion rules one out", "derived from odds of 1 in 20 000")
     max_error: float = gate(1.0, "px", "distance from an epipolar line", "convention: one pixel")
     max_depth: float = gate(50.0, "median depths", "points beyond tell no position", "derived from their share: 1e-3")
     least_cost: float = gate(1e-4, "nats", "cost of a point that fits exactly", "convention: a hundredth of sigma")

@@ -16,7 +16,6 @@ from scipy.spatial import KDTree
 
 from groma._typing import FloatArray
 from groma.features.point_tracks import follow
-from groma.gates import NORMAL
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.features import FrameFeatures
 from groma.tracking.map.keyframes import Followed, add_keyframe
@@ -26,7 +25,7 @@ from groma.tracking.map.points import PointTracks
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.map.triangulation import triangulate
 from groma.tracking.options import TrackOptions
-from groma.tracking.pose.two_views import IDENTITY, Candidate, adjusted, continued, intersected, likely, motions
+from groma.tracking.pose.two_views import IDENTITY, Candidate, likely, proposed, proposed_by_ends, with_third
 
 
 class Initialiser:
@@ -53,7 +52,7 @@ class Initialiser:
         assert self._before is not None
         pixel, good = follow(self._before.gray, data.gray, self._views[-1])
         self._views = [view[good] for view in self._views[:-1]] + [pixel[good]]
-        self._candidates = [replace(one, places=one.places[good]) for one in self._candidates]
+        self._candidates = [replace(one, places=one.places[good], agrees=one.agrees[good]) for one in self._candidates]
         self._before = data
         if good.sum() < self._gates.min_points:
             return self._restart(data)
@@ -81,31 +80,31 @@ class Initialiser:
     def _propose(self) -> None:
         """Find the motions that the first and the present frame allow; the next frames will judge them."""
         one, two = self._views
-        for pose in motions(self._camera, one, two, self._gates):
-            places = intersected(self._camera, one, two, pose)
-            self._candidates.append(Candidate(np.stack([IDENTITY, pose]), places))
+        self._candidates = proposed(self._camera, np.stack([one, two]), self._options.point_sigma_px, self._gates)
         if self._candidates:
             self._views = [one, two, two.copy()]
 
     def _judge(self, data: FrameFeatures) -> FloatArray | None:
         """Adjust all candidates to the three views; return the poses of the one that is left and good."""
-        gates, sigma, views = self._gates, self._options.point_sigma_px, np.stack(self._views)
-        judged = []
-        for candidate in self._candidates:
-            if len(candidate.poses) < len(views):
-                two = adjusted(self._camera, candidate, views[:2], sigma, NORMAL.coordinate)
-                candidate = continued(self._camera, two, views[2], sigma, gates)
-            judged.append(adjusted(self._camera, candidate, views, sigma, NORMAL.coordinate))
-        left = likely(judged, gates)
+        gates, seen = self._gates, (np.stack(self._views), self._options.point_sigma_px, self._gates)
+        left = likely([with_third(self._camera, candidate, *seen) for candidate in self._candidates], gates)
+        if self._is_known(left):
+            # The right motion may not have been proposed when the parallax was less.
+            left = likely([*left, *proposed_by_ends(self._camera, *seen)], gates)
         best = left[0]
         if best.agrees.sum() < max(gates.min_points, gates.min_inliers * len(best.agrees)):
             return self._restart(data)
         self._candidates = left
-        known = math.sqrt(2.0) * sigma / (self._camera.fx * gates.depth_sigma)
-        if len(left) > 1 or np.median(best.parallax()[best.agrees]) < known:
+        if not self._is_known(left):
             return None
         self._pose, self._second = best.poses[-1], data
         return np.stack([IDENTITY, self._pose])
+
+    def _is_known(self, left: list[Candidate]) -> bool:
+        """Whether one motion is left, and parallax tells the depths of its points."""
+        sigma, best = self._options.point_sigma_px, left[0]
+        known = math.sqrt(2.0) * sigma / (self._camera.fx * self._gates.depth_sigma)
+        return len(left) == 1 and bool(np.median(best.parallax()[best.agrees]) >= known)
 
     def make_map(self, track_map: TrackMap) -> tuple[Followed, FloatArray]:
         """Fill an empty map; return what is followed from now on, and the pose of the newest frame."""

@@ -8,19 +8,23 @@ are kept as candidates; each is adjusted with the points in all views so far, un
 .. math:: c = \tfrac12 \sum \min(\|r\|^2 / \sigma^2,\, g^2),
 
 where a pixel that disagrees, and a point behind a camera, counts as an outlier at the gate g. The true noise of points
-that were followed is not known, and what one point errs in several views is much the same; so N points tell about two
+that were followed is not known, and what one point errs in several views is much the same; so n points tell about two
 candidates
 
-.. math:: \tfrac{N}{2} \ln \frac{c_1}{c_2}
+.. math:: \tfrac{n}{2} \ln \frac{c_1}{c_2}
 
-nats, the ratio of their likelihoods at the noise that suits each best. A candidate is ruled out when another one is
-better by ``max_behind``.
+nats, the ratio of their likelihoods at the noise that suits each best. A candidate is ruled out when that is odds of
+1 in 100. But calibration, rolling shutter and the motion itself err alike for neighbours: points of one cell of the
+image are not as many witnesses. Sums of residuals over cells tell, in every frame anew, how many they are: with
+independent errors the square of a sum is the sum of the squares, on average, and n is the number of points over the
+ratio of the two.
 
 Reference: O. Faugeras, F. Lustman, *Motion and structure from motion in a piecewise planar environment*, 1988.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -36,6 +40,7 @@ from groma.scene import Cameras, PointObservations, Points, Scene
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 from groma.tracking.frame.camera import PINHOLE, TrackCamera, into
+from groma.tracking.frame.rectification import cells_of
 from groma.tracking.gates import StartGates
 from groma.tracking.map.map_scene import TRACKING
 
@@ -56,6 +61,8 @@ class Candidate:
     cost: float = np.inf
     #: (N,) which points agree with all views.
     agrees: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
+    #: How many points with independent errors would tell as much.
+    witnesses: float = 0.0
 
     def parallax(self) -> FloatArray:
         """(N,) angle between the rays of the first and of the last view, radians."""
@@ -67,6 +74,9 @@ class Candidate:
 
 def motions(camera: TrackCamera, one: FloatArray, two: FloatArray, gates: StartGates) -> list[FloatArray]:
     """Return the motions, cam_from_world (7,) with a translation of length one, that two views may show.
+
+    With little parallax it is left open whether points are in front of the camera or, for a motion the other way,
+    beyond infinity; so both ways are returned.
 
     Parameters
     ----------
@@ -90,7 +100,9 @@ def motions(camera: TrackCamera, one: FloatArray, two: FloatArray, gates: StartG
             if np.mean(on_plane @ np.asarray(normal).ravel() > 0.0) > 0.5 and np.linalg.norm(t) > 0.0:
                 found.append((np.asarray(R), np.asarray(t)))
     return [
-        np.concatenate([quaternion.from_matrix(R.astype(np.float64)), t.ravel() / np.linalg.norm(t)]) for R, t in found
+        np.concatenate([quaternion.from_matrix(R.astype(np.float64)), sign * t.ravel() / np.linalg.norm(t)])
+        for R, t in found
+        for sign in (1.0, -1.0)
     ]
 
 
@@ -104,7 +116,10 @@ def intersected(camera: TrackCamera, one: FloatArray, two: FloatArray, pose: Flo
 
 
 def adjusted(camera: TrackCamera, candidate: Candidate, pixels: FloatArray, sigma: float, gate: float) -> Candidate:
-    """Adjust a candidate to its views.
+    """Adjust a candidate to its views; its points begin, and are judged, where they agree best with its motion.
+
+    Where the parallax is below the noise, points end behind a camera or far from where they agree, and a point there
+    counts as an outlier in every view: a few of them would tell more than all others.
 
     Parameters
     ----------
@@ -118,6 +133,7 @@ def adjusted(camera: TrackCamera, candidate: Candidate, pixels: FloatArray, sigm
         A pixel beyond so many standard deviations disagrees.
     """
     views, count = len(pixels), len(candidate.places)
+    places, _ = _placed(camera, candidate.poses, candidate.places, pixels, gate * sigma)
     image, point = np.repeat(np.arange(views), count), np.tile(np.arange(count), views)
     cameras = Cameras.of([1], [PINHOLE], [camera.params], [camera.width, camera.height])
     scene = Scene.from_images(
@@ -125,7 +141,7 @@ def adjusted(camera: TrackCamera, candidate: Candidate, pixels: FloatArray, sigm
         [str(view) for view in range(views)],
         np.zeros(views, int),
         candidate.poses,
-        points=Points(np.arange(count) + 1, candidate.places, np.full((count, 3), 128, np.uint8), np.zeros(count)),
+        points=Points(np.arange(count) + 1, places, np.full((count, 3), 128, np.uint8), np.zeros(count)),
         point_observations=PointObservations.numbered(image, point, pixels.reshape(-1, 2), np.full(len(image), sigma)),
     )
     solution = solve(assemble(scene, _ASSEMBLY).problem, _SOLVER)
@@ -135,16 +151,46 @@ def adjusted(camera: TrackCamera, candidate: Candidate, pixels: FloatArray, sigm
     poses = se3.compose(poses, np.tile(se3.inverse(poses[:1]), (views, 1)))
     scale = float(np.median(np.abs(places[:, 2])))
     poses[:, 4:] /= scale
-    places = places / scale
-    squared = np.array([_squared(camera, p, places, seen) for p, seen in zip(poses, pixels, strict=True)]) / sigma**2
-    cost = 0.5 * float(np.minimum(squared, gate**2).sum())
-    return Candidate(poses, places, cost, np.asarray((squared < gate**2).all(axis=0)))
+    places, squared = _placed(camera, poses, places / scale, pixels, gate * sigma)
+    cost = 0.5 * float(np.minimum(squared / sigma**2, gate**2).sum())
+    agrees = np.asarray((squared < (gate * sigma) ** 2).all(axis=0))
+    return Candidate(poses, places, cost, agrees, _witnesses(camera, poses, places[agrees], pixels[:, agrees]))
+
+
+def _witnesses(camera: TrackCamera, poses: FloatArray, places: FloatArray, pixels: FloatArray) -> float:
+    """Return how many points with independent errors would tell as much as these; see the formula above."""
+    away = np.array([camera.project(into(p, places)) - seen for p, seen in zip(poses, pixels, strict=True)])
+    cell = np.unique(cells_of(camera, pixels[0]), return_inverse=True)[1].ravel()
+    sums = np.zeros((cell.max(initial=-1) + 1, away.shape[0], 2))
+    np.add.at(sums, cell, away.transpose(1, 0, 2))
+    return len(places) / max(1.0, float((sums**2).sum() / max((away**2).sum(), 1e-300)))
+
+
+def _placed(
+    camera: TrackCamera, poses: FloatArray, places: FloatArray, pixels: FloatArray, max_error: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return points (N, 3) where they were or where two rays meet, whichever agrees best, and squared errors (V, N).
+
+    Errors are in pixels, counted up to the largest that agrees.
+    """
+    others = [
+        intersected(camera, pixels[0], seen, pose)
+        for pose, seen in zip(poses[1:], pixels[1:], strict=True)
+        if pose[4:].any()
+    ]
+    proposed = np.array([places, *others])
+    squared = np.array(
+        [[_squared(camera, pose, at, seen) for pose, seen in zip(poses, pixels, strict=True)] for at in proposed]
+    )
+    best = np.minimum(squared, max_error**2).sum(axis=1).argmin(axis=0)
+    points = np.arange(len(places))
+    return proposed[best, points], squared[best, :, points].T
 
 
 def continued(
     camera: TrackCamera, candidate: Candidate, pixels: FloatArray, sigma: float, gates: StartGates
 ) -> Candidate:
-    """Return a candidate with the pose of one more view: from where it shows the candidate's points, or the last one.
+    """Return a candidate with the pose of a third view: from where it shows the candidate's points, or the last one.
 
     Points too far away to tell a position are left out; their numbers would spoil a closed form.
     """
@@ -158,7 +204,33 @@ def continued(
         ).cam_from_world
         poses += [] if found is None else [found]
     costs = [np.minimum(_squared(camera, pose, candidate.places, pixels), max_error**2).sum() for pose in poses]
-    return replace(candidate, poses=np.concatenate([candidate.poses, poses[int(np.argmin(costs))][None]]))
+    return replace(candidate, poses=np.concatenate([candidate.poses[:2], poses[int(np.argmin(costs))][None]]))
+
+
+def proposed(camera: TrackCamera, pixels: FloatArray, sigma: float, gates: StartGates) -> list[Candidate]:
+    """Return the motions that two views (2, N, 2) allow, adjusted to them."""
+    one, two = pixels
+    begun = [
+        Candidate(np.stack([IDENTITY, pose]), intersected(camera, one, two, pose))
+        for pose in motions(camera, one, two, gates)
+    ]
+    return [adjusted(camera, candidate, pixels, sigma, NORMAL.coordinate) for candidate in begun]
+
+
+def with_third(
+    camera: TrackCamera, candidate: Candidate, pixels: FloatArray, sigma: float, gates: StartGates
+) -> Candidate:
+    """Return a candidate of the first two of three views (3, N, 2), or of all, adjusted to all."""
+    third = continued(camera, candidate, pixels[2], sigma, gates)
+    return adjusted(camera, third, pixels, sigma, NORMAL.coordinate)
+
+
+def proposed_by_ends(camera: TrackCamera, pixels: FloatArray, sigma: float, gates: StartGates) -> list[Candidate]:
+    """Return the motions that the first and the last of three views (3, N, 2) allow, adjusted to all."""
+    order = [0, 2, 1]
+    found = proposed(camera, pixels[order[:2]], sigma, gates)
+    found = [with_third(camera, candidate, pixels[order], sigma, gates) for candidate in found]
+    return [replace(candidate, poses=candidate.poses[order]) for candidate in found]
 
 
 def _squared(camera: TrackCamera, pose: FloatArray, places: FloatArray, pixels: FloatArray) -> FloatArray:
@@ -171,17 +243,18 @@ def likely(candidates: list[Candidate], gates: StartGates) -> list[Candidate]:
     """Return the candidates that are not ruled out, the best first, each motion once."""
     kept: list[Candidate] = []
     for candidate in sorted(candidates, key=lambda one: one.cost):
-        if kept and _behind(candidate, kept[0], gates.least_cost) > gates.max_behind:
+        if kept and behind(candidate, kept[0], gates):
             break
         if not any(_same(candidate.poses[-1], other.poses[-1], gates) for other in kept):
             kept.append(candidate)
     return kept
 
 
-def _behind(candidate: Candidate, best: Candidate, least_cost: float) -> float:
-    """By how many nats a candidate is less likely than another; see the formula above."""
-    count = len(candidate.places)
-    return 0.5 * count * float(np.log((candidate.cost + least_cost * count) / (best.cost + least_cost * count)))
+def behind(candidate: Candidate, best: Candidate, gates: StartGates) -> bool:
+    """Whether a candidate is ruled out by another one; see the formula above."""
+    least = gates.least_cost * len(candidate.places)
+    nats = 0.5 * best.witnesses * math.log((candidate.cost + least) / (best.cost + least))
+    return nats > -math.log(NORMAL.false_alarm)
 
 
 def _same(one: FloatArray, two: FloatArray, gates: StartGates) -> bool:
