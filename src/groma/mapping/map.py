@@ -70,6 +70,7 @@ from groma.mapping.photographs import (
     image_files,
     image_reader,
     images_left_out,
+    smaller_copies,
 )
 from groma.mapping.read_rows import adjust_read_rows, mapped_as_measured, read_by_rows, taken_at_once
 from groma.mapping.refine_points import refine_points
@@ -162,6 +163,11 @@ def map_images(
     read_by_rows(model or Scene(), options, depth)  # refuses depths beside it before anything is computed
     check_number(folder, names, copies, model, options.lines.min_images)
     sizes = check_images(folder, names, model, say)
+    if alone:
+        copies |= smaller_copies(folder, sizes)
+        names = [name for name in names if name not in copies]
+        sizes = {name: sizes[name] for name in names}
+        check_number(folder, names, copies, model, options.lines.min_images)
     if survey:
         check_survey(survey, tuple(sizes), list(sizes.values()))
     key = digest(__version__, digest_files(folder, files), model)

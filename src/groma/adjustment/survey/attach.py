@@ -25,6 +25,7 @@ from groma.adjustment.survey.similarity import GATES, RobustSimilarity
 from groma.adjustment.survey.tables import control_tables, position_table
 from groma.adjustment.survey.triangulate import triangulated
 from groma.adjustment.terms.objects import name_of
+from groma.gates import NORMAL, chi_square_gate
 from groma.geometry import se3
 from groma.io.survey import WorldFrame, common_frame
 from groma.scene import Cameras, PosePriors, Scene, Similarity
@@ -149,13 +150,17 @@ def _with_places(scene: Scene, survey: Survey, notes: list[str]) -> tuple[Scene,
 def _with_shown_noise(scene: Scene, survey: Survey, fit: RobustSimilarity, notes: list[str]) -> Scene:
     """Return the scene whose positions have the noise that they show about its cameras, where nobody stated any.
 
-    An error that all of them have in common does not show. So they keep the usual noise beside other measurements of
-    where the scene is, and where they are too few, on a line or without heights.
+    What most of them agree on would be too little: receivers drift, and part of a flight is metres beside the rest. So
+    all that the usual noise allows for count. An error that all of them have in common does not show: they keep the
+    usual noise beside other measurements of where the scene is, and where they are too few, on a line or without
+    heights.
     """
     given, table = survey.positions, scene.camera_positions
     if given is None or not given.usual_sigma or survey.position_sigma or np.isfinite(given.sigma).any():
         return scene
-    residuals = fit.residuals[: len(table)][fit.inliers[: len(table)]]
+    residuals = fit.residuals[: len(table)]
+    usual = ((residuals / given.usual_sigma) ** 2).sum(axis=1) <= chi_square_gate(NORMAL.gross, 3)
+    residuals = residuals[usual]
     spare = len(residuals) - 3  # derived from a similarity of level places: of seven three for heights
     placed_otherwise = any(one is not None for one in (survey.control, survey.planes, survey.poses))
     if spare < GATES.spare or fit.on_line or placed_otherwise:
