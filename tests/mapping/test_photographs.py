@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from groma.errors import InputError
-from groma.mapping.photographs import check_names, copies_among, copies_left_out, image_files, read_gray, smaller_copies
+from groma.mapping.photographs import (
+    check_names,
+    copies_among,
+    copies_left_out,
+    image_files,
+    read_gray,
+    smaller_copies,
+    unread_photographs,
+)
 
 
 def test_every_kind_of_image_is_read_as_it_is_stored(tmp_path):
@@ -89,6 +97,23 @@ def test_one_photograph_in_several_sizes_is_one(tmp_path, corner):
     copies = {"half/a.jpg": "a.png", "quarter/b.jpg": "b.png", "third/b.png": "b.png"}
     assert smaller_copies(tmp_path, sizes) == copies
     assert smaller_copies(tmp_path, {"a.png": sizes["a.png"], "b.png": sizes["b.png"]}) == {}
+
+
+def test_photographs_that_are_not_read_are_told(tmp_path):
+    """Telephones write HEIC; a raw file beside its JPEG is no further photograph."""
+    for name in ("a.HEIC", "b.heic"):
+        (tmp_path / name).write_bytes(b"")
+    with pytest.raises(InputError, match=r"2 photographs of a kind that is not read: a.HEIC, b.heic. Convert them"):
+        image_files(tmp_path)
+    for name in ("c.jpg", "c.dng", "d.JPG"):
+        (tmp_path / name).write_bytes(b"")
+    names = [path.name for path in image_files(tmp_path)]
+    assert names == ["c.jpg", "d.JPG"]
+    said = "2 photographs of a kind that is not read: a.HEIC, b.heic. Convert them to JPEG or PNG."
+    assert (
+        unread_photographs(tmp_path, names) == [said]
+        and unread_photographs(tmp_path, ["a.jpg", "b.jpg", "c.jpg"]) == []
+    )
 
 
 def test_the_whole_disk_is_no_folder_of_images(monkeypatch):

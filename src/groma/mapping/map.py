@@ -66,10 +66,9 @@ from groma.mapping.photographs import (
     check_images,
     check_number,
     copies_among,
-    copies_left_out,
     image_files,
     image_reader,
-    images_left_out,
+    photographs_left_out,
     smaller_copies,
 )
 from groma.mapping.read_rows import adjust_read_rows, mapped_as_measured, read_by_rows, taken_at_once
@@ -199,8 +198,8 @@ def map_images(
         seen = taken_at_once(points, segments)
         result = map_segments(seen.scene, seen.segments, matches, stages, neighbors_for(options, folder), beside)
         result = with_measured_lines(mapped_as_measured(result, seen, stages), start)
-    left_out = images_left_out(names, (model or start).images.names, model is not None)
-    left_out = (*copies_left_out(copies, len(files)), *left_out, *not_carried(given or Scene(), result.scene))
+    left_out = photographs_left_out(folder, files, copies, (model or start).images.names, model is not None)
+    left_out = (*left_out, *not_carried(given or Scene(), result.scene))
     result = dataclasses.replace(
         result,
         start=start,

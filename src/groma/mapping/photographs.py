@@ -24,7 +24,7 @@ import numpy as np
 from groma._counted import counted, first_of
 from groma._typing import FloatArray
 from groma.bounded.images import decoded
-from groma.bounded.names import IMAGES, VIDEOS, is_text
+from groma.bounded.names import IMAGES, UNREAD, VIDEOS, is_text
 from groma.bounded.text import shown
 from groma.cameras import model as camera_model
 from groma.errors import FileFormatError, GromaError, InputError
@@ -65,13 +65,10 @@ def image_files(folder: Path) -> list[Path]:
             f"{folder} is the whole disk, not a folder of images: every picture on it would be taken. Pass the folder "
             "that holds the photographs."
         )
-    files: list[Path] = []
-    for place, folders, names in os.walk(folder):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        pictures = [name for name in names if not name.startswith(".") and name.lower().endswith(IMAGES)]
-        files += [path for name in pictures if (path := Path(place, name)).is_file()]
-    files.sort()
+    files = _with_endings(folder, IMAGES)
     if not files:
+        if others := _with_endings(folder, UNREAD):
+            raise InputError(f"{folder} holds {_of_unread_kind(others, folder)}. Convert them to JPEG or PNG.")
         raise InputError(f"{folder} holds no images ({', '.join(IMAGES)}). Check the path.")
     wrong = next((name for path in files if not is_text(name := path.relative_to(folder).as_posix())), None)
     if wrong is not None:
@@ -79,6 +76,31 @@ def image_files(folder: Path) -> list[Path]:
             f"The name of the image {shown(wrong)} cannot stand in a model: it must be UTF-8, in one line. Rename it."
         )
     return files
+
+
+def _with_endings(folder: Path, endings: tuple[str, ...]) -> list[Path]:
+    files: list[Path] = []
+    for place, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        pictures = [name for name in names if not name.startswith(".") and name.lower().endswith(endings)]
+        files += [path for name in pictures if (path := Path(place, name)).is_file()]
+    return sorted(files)
+
+
+def _of_unread_kind(files: Sequence[Path], folder: Path) -> str:
+    names = first_of([path.relative_to(folder).as_posix() for path in files], 3)
+    return f"{counted(len(files), 'photographs')} of a kind that is not read: {names}"
+
+
+def unread_photographs(folder: Path, names: Sequence[str]) -> list[str]:
+    """Say which photographs of a folder are of a kind that is not read, in at most one sentence.
+
+    A raw file is none of them if the camera wrote a JPEG beside it.
+    """
+    read = {posixpath.splitext(name)[0] for name in names}
+    others = _with_endings(folder, UNREAD)
+    alone = [path for path in others if path.relative_to(folder).with_suffix("").as_posix() not in read]
+    return [f"{_of_unread_kind(alone, folder)}. Convert them to JPEG or PNG."] if alone else []
 
 
 def content_digest(path: Path) -> str:
@@ -149,7 +171,7 @@ def _glance(path: Path) -> FloatArray:
 
 def _is_made_smaller(larger: Path, smaller: Path) -> bool:
     small = read_gray(smaller)
-    made = cv2.resize(read_gray(larger), small.shape[::-1], interpolation=cv2.INTER_AREA)
+    made = np.asarray(cv2.resize(read_gray(larger), small.shape[::-1], interpolation=cv2.INTER_AREA), np.uint8)
     first, second = (cv2.Laplacian(smoothed(one), cv2.CV_32F).ravel() for one in (made, small))
     return bool(first @ second >= COPIES.alike * np.linalg.norm(first) * np.linalg.norm(second))
 
@@ -243,6 +265,16 @@ def check_cameras(models: Sequence[str]) -> None:
                 f"groma localize places images that are flat, and {name} images are panoramas. Map perspective views "
                 "of them that are held in a rig, as COLMAP's panorama_sfm.py cuts them."
             )
+
+
+def photographs_left_out(
+    folder: Path, files: Sequence[Path], copies: Mapping[str, str], used: Sequence[str], model_given: bool
+) -> list[str]:
+    """Say which photographs of a folder are not in a map, and why, a sentence for each reason."""
+    names = [path.relative_to(folder).as_posix() for path in files]
+    unread = [] if model_given else unread_photographs(folder, names)
+    rest = [name for name in names if name not in copies]
+    return [*unread, *copies_left_out(copies, len(names)), *images_left_out(rest, used, model_given)]
 
 
 def images_left_out(names: Sequence[str], used: Sequence[str], model_given: bool) -> list[str]:
