@@ -267,6 +267,33 @@ def check_cameras(models: Sequence[str]) -> None:
             )
 
 
+def checked_photographs(
+    folder: Path,
+    files: Sequence[Path],
+    model: Scene | None,
+    min_images: int,
+    without_copies: bool,
+    say: Callable[[str, int, int], None],
+) -> tuple[dict[str, tuple[int, int]], dict[str, str]]:
+    """Return the photographs to map, by name with width and height, and those left out as copies of others.
+
+    Raises
+    ------
+    InputError
+        If they are too few, cannot be read, or are not those of the model.
+    """
+    names = [path.relative_to(folder).as_posix() for path in files]
+    copies = copies_among(folder, names) if without_copies else {}
+    names = [name for name in names if name not in copies]
+    check_number(folder, names, copies, model, min_images)
+    sizes = check_images(folder, names, model, say)
+    if without_copies:
+        copies |= smaller_copies(folder, sizes)
+        sizes = {name: size for name, size in sizes.items() if name not in copies}
+        check_number(folder, list(sizes), copies, model, min_images)
+    return sizes, copies
+
+
 def photographs_left_out(
     folder: Path, files: Sequence[Path], copies: Mapping[str, str], used: Sequence[str], model_given: bool
 ) -> list[str]:
