@@ -53,6 +53,38 @@ def test_an_adjustment_with_positions_is_better_than_either(truth_and_start):
     assert rms[2] < 0.8 * rms[0] and rms[2] < rms[1]
 
 
+def test_positions_of_unknown_accuracy_have_the_noise_that_they_show(truth_and_start):
+    """Of twelve cameras nine heights and twenty others are to spare, from which noise is known: three times that."""
+    truth, rng = made(images=12)[0], np.random.default_rng(5)
+    noise = rng.normal(size=(truth.num_images, 3)) * [0.01, 0.01, 0.03]
+    given = places_of(truth.images.names, truth.cam_centers_in_world + noise, np.nan)
+    given = replace(given, usual_sigma=(5.0, 5.0, 10.0), source="EXIF")
+    elsewhere = truth.transformed(ELSEWHERE)
+
+    def deviations(survey):
+        found = with_survey(elsewhere, survey)
+        told = [note for note in found.notes if "share does not show" in note]
+        return np.sqrt(np.diagonal(found.scene.camera_positions.covariance, axis1=1, axis2=2))[0], told
+
+    sigma, told = deviations(Survey(positions=given))
+    for found, true, spare in zip(sigma[1:], (0.01, 0.03), (20, 9), strict=True):
+        assert found == pytest.approx(true, rel=3 / np.sqrt(2 * spare))
+    assert len(told) == 1 and "(5, 10)" in told[0]
+    for survey, usual in (
+        (Survey(positions=given, position_sigma=(0.2,)), [0.2] * 3),  # the user knows
+        (
+            Survey(positions=given, control=control_file(truth, rng)[0], control_sigma=(SIGMA,)),
+            [5, 5, 10],
+        ),  # what they share would contradict
+        (Survey(positions=replace(given, sigma=np.full((12, 3), 0.5))), [0.5] * 3),  # the file knows
+    ):
+        assert deviations(survey) == (pytest.approx(usual), [])
+    few, _ = truth_and_start
+    given = replace(measured_positions(few, rng), sigma=np.full((8, 3), np.nan), usual_sigma=(5.0, 5.0, 10.0))
+    found = with_survey(few, Survey(positions=given))
+    assert found.scene.camera_positions.covariance[0, 0, 0] == pytest.approx(25.0)
+
+
 def test_far_from_the_origin_nothing_changes(truth_and_start):
     """The same scene, measured in coordinates of UTM: the same steps and the same result, shifted."""
     truth, start = truth_and_start

@@ -247,7 +247,7 @@ def test_damaged_files(tmp_path, read, text, words):
         read(written(tmp_path, "file", text))
 
 
-def tiff_with_position(order, latitude, longitude, altitude, below=0, before=0):
+def tiff_with_position(order, latitude, longitude, altitude, below=0, before=0, error=np.nan):
     """A TIFF structure that holds a position, by the standard: two directories, after other bytes, and their values."""
 
     def rationals(values):
@@ -259,12 +259,13 @@ def tiff_with_position(order, latitude, longitude, altitude, below=0, before=0):
         minutes = (abs(value) - whole) * 60
         return rationals([whole, int(minutes), (minutes - int(minutes)) * 60])
 
-    gps_at, count = 26 + before, 6
+    gps_at, count = 26 + before, 7
     values_at = gps_at + 2 + 12 * count + 4
     entries = [
         (1, 2, 2, (b"N" if latitude >= 0 else b"S") + b"\0\0\0"), (2, 5, 3, struct.pack(order + "I", values_at)),
         (3, 2, 2, (b"E" if longitude >= 0 else b"W") + b"\0\0\0"), (4, 5, 3, struct.pack(order + "I", values_at + 24)),
         (5, 1, 1, bytes([below, 0, 0, 0])), (6, 5, 1, struct.pack(order + "I", values_at + 48)),
+        (31, 5, 1, struct.pack(order + "I", values_at + 56)),
     ]  # fmt: skip
     tiff = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(order + "I", 8 + before) + bytes(before)
     tiff += (
@@ -272,7 +273,7 @@ def tiff_with_position(order, latitude, longitude, altitude, below=0, before=0):
     )
     tiff += struct.pack(order + "H", count)
     tiff += b"".join(struct.pack(order + "HHI", tag, kind, number) + value for tag, kind, number, value in entries)
-    return tiff + struct.pack(order + "I", 0) + degrees(latitude) + degrees(longitude) + rationals([altitude])
+    return tiff + struct.pack(order + "I", 0) + degrees(latitude) + degrees(longitude) + rationals([altitude, error])
 
 
 def jpeg_with_position(*position, **more):
@@ -289,7 +290,30 @@ def test_positions_in_exif(tmp_path, order):
     found = read_exif_positions(tmp_path, ["a.jpg", "b.jpg", "none.jpg", "missing.jpg"])
     assert found.names == ("a.jpg", "b.jpg") and found.system.is_geographic
     np.testing.assert_allclose(found.coordinates, [[151.25, -34.5, -12.5], [-13.4007, 52.51926, 99]], atol=1e-7)
-    assert "2 photographs without a position" in found.notes[0] and found.sigma[0].tolist() == [5, 5, 10]
+    assert "2 photographs without a position" in found.notes[0]
+    assert np.isnan(found.sigma).all() and found.usual_sigma == (5, 5, 10)
+
+
+XMP = {
+    "attributes": 'drone-dji:RtkStdLon="0.011" drone-dji:RtkStdLat="+0.012" drone-dji:RtkStdHgt="0.03"',
+    "elements": "<Camera:GPSXYAccuracy>0.011</Camera:GPSXYAccuracy> <Camera:GPSZAccuracy>3/100</Camera:GPSZAccuracy>",
+}
+
+
+def test_accuracies_in_exif_and_xmp(tmp_path):
+    """What is written counts; zeros, and what is no number, say nothing."""
+    for name, given in {
+        "error.jpg": ({"error": 4.5}, ""),
+        "zero.jpg": ({"error": 0.0}, '<Camera:GPSXYAccuracy>0</Camera:GPSXYAccuracy> drone-dji:RtkStdLon="1e-e"'),
+        "dji.jpg": ({"error": 4.5}, XMP["attributes"]),
+        "pix4d.jpg": ({}, XMP["elements"]),
+    }.items():
+        body = b"http://ns.adobe.com/xap/1.0/\0" + given[1].encode()
+        head = jpeg_with_position("<", 52.5, 13.4, 99, **given[0])[:-2]
+        (tmp_path / name).write_bytes(head + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + b"\xff\xda")
+    found = read_exif_positions(tmp_path, ["error.jpg", "zero.jpg", "dji.jpg", "pix4d.jpg"])
+    expected = [[4.5, 4.5, 9.0], [np.nan] * 3, [0.011, 0.012, 0.03], [0.011, 0.011, 0.03]]
+    np.testing.assert_allclose(found.sigma, expected)
 
 
 def test_positions_in_tiff_files_whose_directories_follow_the_pixels(tmp_path):
@@ -302,7 +326,7 @@ def test_a_height_of_zero_by_zero_is_unknown(tmp_path):
     (tmp_path / "a.jpg").write_bytes(jpeg_with_position("<", 52.5, 13.4, np.nan))
     (tmp_path / "b.jpg").write_bytes(jpeg_with_position("<", 52.5, 13.4, 99))
     found = read_exif_positions(tmp_path, ["a.jpg", "b.jpg"])
-    assert found.coordinates[:, 2].tolist() == [99, 99] and found.sigma[:, 2].tolist() == [1e4, 10]
+    assert found.coordinates[:, 2].tolist() == [99, 99] and np.array_equal(found.sigma[:, 2], [1e4, np.nan], True)
     assert "1 photograph without a height" in found.notes[0]
 
 

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from groma.errors import InputError
-from groma.mapping.photographs import check_names, copies_among, copies_left_out, image_files, read_gray
+from groma.mapping.photographs import (
+    check_names,
+    copies_among,
+    copies_left_out,
+    image_files,
+    read_gray,
+    smaller_copies,
+    unread_photographs,
+)
 
 
 def test_every_kind_of_image_is_read_as_it_is_stored(tmp_path):
@@ -59,6 +67,53 @@ def test_copies_are_no_further_photographs(tmp_path):
     assert copies == {"a (1).jpg": "a.jpg", "b/a.jpg": "a.jpg"}
     said = "2 of 5 images are copies of others and were not used: a (1).jpg of a.jpg, b/a.jpg of a.jpg."
     assert copies_left_out(copies, 5) == [said] and copies_left_out({}, 5) == []
+
+
+def test_one_photograph_in_several_sizes_is_one(tmp_path, corner):
+    """Its copies are known by their edges: however they were made smaller, saved, or made brighter."""
+    images, _ = corner
+    files = sorted(images.iterdir())
+    first, second = (cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in files[:2])
+    shifted = cv2.warpAffine(
+        first, np.array([[1.0, 0, 2], [0, 1, 0]]), first.shape[::-1], borderMode=cv2.BORDER_REPLICATE
+    )
+
+    def made(name, image, size, way, quality=90):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        small = cv2.resize(image, size, interpolation=way)
+        cv2.imwrite(str(tmp_path / name), small, [cv2.IMWRITE_JPEG_QUALITY, quality] if name.endswith("jpg") else [])
+
+    for name, image in {"a.png": first, "b.png": second}.items():
+        cv2.imwrite(str(tmp_path / name), image)
+    made("half/a.jpg", first, (240, 180), cv2.INTER_AREA)
+    made("quarter/b.jpg", second, (120, 90), cv2.INTER_LANCZOS4, 60)
+    made("third/b.png", np.uint8(255 * (second / 255.0) ** 0.7), (161, 121), cv2.INTER_CUBIC)
+    made("moved.png", shifted, (240, 180), cv2.INTER_AREA)  # by a pixel
+    made("stretched.png", first, (240, 200), cv2.INTER_AREA)
+    cv2.imwrite(str(tmp_path / "again.jpg"), first, [cv2.IMWRITE_JPEG_QUALITY, 90])  # of the same size
+    sizes = {
+        path.relative_to(tmp_path).as_posix(): cv2.imread(str(path), 0).shape[::-1] for path in image_files(tmp_path)
+    }
+    copies = {"half/a.jpg": "a.png", "quarter/b.jpg": "b.png", "third/b.png": "b.png"}
+    assert smaller_copies(tmp_path, sizes) == copies
+    assert smaller_copies(tmp_path, {"a.png": sizes["a.png"], "b.png": sizes["b.png"]}) == {}
+
+
+def test_photographs_that_are_not_read_are_told(tmp_path):
+    """Telephones write HEIC; a raw file beside its JPEG is no further photograph."""
+    for name in ("a.HEIC", "b.heic"):
+        (tmp_path / name).write_bytes(b"")
+    with pytest.raises(InputError, match=r"2 photographs of a kind that is not read: a.HEIC, b.heic. Convert them"):
+        image_files(tmp_path)
+    for name in ("c.jpg", "c.dng", "d.JPG"):
+        (tmp_path / name).write_bytes(b"")
+    names = [path.name for path in image_files(tmp_path)]
+    assert names == ["c.jpg", "d.JPG"]
+    said = "2 photographs of a kind that is not read: a.HEIC, b.heic. Convert them to JPEG or PNG."
+    assert (
+        unread_photographs(tmp_path, names) == [said]
+        and unread_photographs(tmp_path, ["a.jpg", "b.jpg", "c.jpg"]) == []
+    )
 
 
 def test_the_whole_disk_is_no_folder_of_images(monkeypatch):

@@ -95,6 +95,11 @@ def test_up():
     # From above, on the way there and back: up is where they were taken.
     there, back = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]), np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
     np.testing.assert_allclose(upward(np.array([there, back])), [-1, 0, 0])
+    np.testing.assert_allclose(
+        upward(np.array([there, back, there])), [-1, 0, 0]
+    )  # a strip more one way than the other
+    # A telephone before a wall, every second time held upright: a mean of both, but not across the wall.
+    np.testing.assert_allclose(upward(np.array([np.eye(3), [[0, -1, 0], [1, 0, 0], [0, 0, 1]]]))[2], 0)
 
 
 def test_where_heights_are_measured_z_is_up():

@@ -62,15 +62,7 @@ from groma.mapping.lines.matches import MatchProvider
 from groma.mapping.noise.observations import line_bend, line_end_correlation, moved_px, noise_px, with_point_noise
 from groma.mapping.noise.shared import with_shared_noise
 from groma.mapping.options import MapOptions, StageProgress
-from groma.mapping.photographs import (
-    check_images,
-    check_number,
-    copies_among,
-    copies_left_out,
-    image_files,
-    image_reader,
-    images_left_out,
-)
+from groma.mapping.photographs import checked_photographs, image_files, image_reader, photographs_left_out
 from groma.mapping.read_rows import adjust_read_rows, mapped_as_measured, read_by_rows, taken_at_once
 from groma.mapping.refine_points import refine_points
 from groma.mapping.result import SCENES_OF_RESULT, MapResult, result_of
@@ -147,10 +139,7 @@ def map_images(
     say = logged_stages("mapping", progress)
     folder = Path(images)
     files = image_files(folder)
-    names = [path.relative_to(folder).as_posix() for path in files]
     alone = model is None and line_matches is None and not options.rigs
-    copies = copies_among(folder, names) if alone else {}
-    names = [name for name in names if name not in copies]
     given = model
     model = None if model is None else ready_to_map(model)
     if model is not None and options.camera_model is not None:
@@ -160,8 +149,8 @@ def map_images(
     if model is not None and near is not None:
         model = model.transformed(near)
     read_by_rows(model or Scene(), options, depth)  # refuses depths beside it before anything is computed
-    check_number(folder, names, copies, model, options.lines.min_images)
-    sizes = check_images(folder, names, model, say)
+    sizes, copies = checked_photographs(folder, files, model, options.lines.min_images, alone, say)
+    names = list(sizes)
     if survey:
         check_survey(survey, tuple(sizes), list(sizes.values()))
     key = digest(__version__, digest_files(folder, files), model)
@@ -193,8 +182,8 @@ def map_images(
         seen = taken_at_once(points, segments)
         result = map_segments(seen.scene, seen.segments, matches, stages, neighbors_for(options, folder), beside)
         result = with_measured_lines(mapped_as_measured(result, seen, stages), start)
-    left_out = images_left_out(names, (model or start).images.names, model is not None)
-    left_out = (*copies_left_out(copies, len(files)), *left_out, *not_carried(given or Scene(), result.scene))
+    left_out = photographs_left_out(folder, files, copies, (model or start).images.names, model is not None)
+    left_out = (*left_out, *not_carried(given or Scene(), result.scene))
     result = dataclasses.replace(
         result,
         start=start,

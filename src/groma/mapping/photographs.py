@@ -8,26 +8,48 @@ camera of a model has the size of the stored image.
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import posixpath
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import cv2
+import numpy as np
 
 from groma._counted import counted, first_of
+from groma._typing import FloatArray
 from groma.bounded.images import decoded
-from groma.bounded.names import IMAGES, VIDEOS, is_text
+from groma.bounded.names import IMAGES, UNREAD, VIDEOS, is_text
 from groma.bounded.text import shown
 from groma.cameras import model as camera_model
 from groma.errors import FileFormatError, GromaError, InputError
 from groma.execution import map_work
-from groma.features.images import GrayImage, to_gray
+from groma.features.images import GrayImage, smoothed, to_gray
+from groma.gates import gate
 from groma.scene import Scene
 
+
+@dataclass(frozen=True)
+class CopyGates:
+    """When two images of different sizes are one photograph."""
+
+    alike: float = gate(
+        0.8, "share", "correlation of the curvature of grey levels",
+        "chosen on 10 internet photographs in two sizes (0.98 and more; others 0.01); half a pixel leaves 0.8 to 0.95",
+    )  # fmt: skip
+    glance: int = gate(32, "px", "side of the images that are compared first", "cost: time")
+    glance_alike: float = gate(
+        0.9, "share", "their correlation, from which images are compared as a whole", "cost: time"
+    )
+    tries: int = gate(3, "images", "that one is compared with, the most alike first", "cost: time")
+
+
+COPIES = CopyGates()
 _START_OF_SCAN, _END_OF_IMAGE = b"\xff\xda", b"\xff\xd9"
 
 
@@ -43,13 +65,10 @@ def image_files(folder: Path) -> list[Path]:
             f"{folder} is the whole disk, not a folder of images: every picture on it would be taken. Pass the folder "
             "that holds the photographs."
         )
-    files: list[Path] = []
-    for place, folders, names in os.walk(folder):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        pictures = [name for name in names if not name.startswith(".") and name.lower().endswith(IMAGES)]
-        files += [path for name in pictures if (path := Path(place, name)).is_file()]
-    files.sort()
+    files = _with_endings(folder, IMAGES)
     if not files:
+        if others := _with_endings(folder, UNREAD):
+            raise InputError(f"{folder} holds {_of_unread_kind(others, folder)}. Convert them to JPEG or PNG.")
         raise InputError(f"{folder} holds no images ({', '.join(IMAGES)}). Check the path.")
     wrong = next((name for path in files if not is_text(name := path.relative_to(folder).as_posix())), None)
     if wrong is not None:
@@ -57,6 +76,31 @@ def image_files(folder: Path) -> list[Path]:
             f"The name of the image {shown(wrong)} cannot stand in a model: it must be UTF-8, in one line. Rename it."
         )
     return files
+
+
+def _with_endings(folder: Path, endings: tuple[str, ...]) -> list[Path]:
+    files: list[Path] = []
+    for place, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        pictures = [name for name in names if not name.startswith(".") and name.lower().endswith(endings)]
+        files += [path for name in pictures if (path := Path(place, name)).is_file()]
+    return sorted(files)
+
+
+def _of_unread_kind(files: Sequence[Path], folder: Path) -> str:
+    names = first_of([path.relative_to(folder).as_posix() for path in files], 3)
+    return f"{counted(len(files), 'photographs')} of a kind that is not read: {names}"
+
+
+def unread_photographs(folder: Path, names: Sequence[str]) -> list[str]:
+    """Say which photographs of a folder are of a kind that is not read, in at most one sentence.
+
+    A raw file is none of them if the camera wrote a JPEG beside it.
+    """
+    read = {posixpath.splitext(name)[0] for name in names}
+    others = _with_endings(folder, UNREAD)
+    alone = [path for path in others if path.relative_to(folder).with_suffix("").as_posix() not in read]
+    return [f"{_of_unread_kind(alone, folder)}. Convert them to JPEG or PNG."] if alone else []
 
 
 def content_digest(path: Path) -> str:
@@ -81,6 +125,55 @@ def copies_among(folder: Path, names: Sequence[str]) -> dict[str, str]:
             if other != name:
                 found[name] = other
     return found
+
+
+def smaller_copies(folder: Path, sizes: Mapping[str, tuple[int, int]]) -> dict[str, str]:
+    """Return the images that are another one in a smaller size, by name, and the largest of that picture.
+
+    Made smaller, the larger one has the edges of the smaller where this has them, to a fraction of a pixel all over the
+    image; a second photograph has not, however near it was taken. Copies of one size are not looked for: a camera that
+    stood still cannot be told from them.
+
+    Parameters
+    ----------
+    folder : Path
+        The photographs.
+    sizes : mapping
+        Width and height by name.
+    """
+    names = sorted(sizes, key=lambda name: (-math.prod(sizes[name]), len(name), name))
+    size = np.array([sizes[name] for name in names], float).reshape(-1, 2)
+    ratio = size / size[:, None]
+    # derived from sizes that are whole pixels
+    alike = (np.abs(ratio[..., 0] - ratio[..., 1]) <= (1.0 / size).sum(axis=1)[:, None]) & (ratio < 1.0).all(axis=2)
+    rows = np.flatnonzero(alike.any(axis=0) | alike.any(axis=1))
+    glance = np.zeros((len(names), COPIES.glance**2))
+    for row, numbers in zip(rows, map_work(_glance, [folder / names[row] for row in rows]), strict=True):
+        glance[row] = numbers
+    found: dict[str, str] = {}
+    for row in rows:
+        likeness = np.where(alike[:, row], glance @ glance[row], 0.0)
+        for other in np.argsort(-likeness, kind="stable")[: COPIES.tries]:
+            if likeness[other] < COPIES.glance_alike:
+                break
+            if names[other] not in found and _is_made_smaller(folder / names[other], folder / names[row]):
+                found[names[row]] = names[other]
+                break
+    return found
+
+
+def _glance(path: Path) -> FloatArray:
+    """Return a photograph as a few numbers, without its mean and of length one."""
+    levels = cv2.resize(read_gray(path), (COPIES.glance,) * 2, interpolation=cv2.INTER_AREA).astype(float).ravel()
+    levels -= levels.mean()
+    return levels / max(float(np.linalg.norm(levels)), 1e-12)
+
+
+def _is_made_smaller(larger: Path, smaller: Path) -> bool:
+    small = read_gray(smaller)
+    made = np.asarray(cv2.resize(read_gray(larger), small.shape[::-1], interpolation=cv2.INTER_AREA), np.uint8)
+    first, second = (cv2.Laplacian(smoothed(one), cv2.CV_32F).ravel() for one in (made, small))
+    return bool(first @ second >= COPIES.alike * np.linalg.norm(first) * np.linalg.norm(second))
 
 
 def image_reader(folder: Path, names: Sequence[str]) -> Callable[[int], GrayImage]:
@@ -172,6 +265,43 @@ def check_cameras(models: Sequence[str]) -> None:
                 f"groma localize places images that are flat, and {name} images are panoramas. Map perspective views "
                 "of them that are held in a rig, as COLMAP's panorama_sfm.py cuts them."
             )
+
+
+def checked_photographs(
+    folder: Path,
+    files: Sequence[Path],
+    model: Scene | None,
+    min_images: int,
+    without_copies: bool,
+    say: Callable[[str, int, int], None],
+) -> tuple[dict[str, tuple[int, int]], dict[str, str]]:
+    """Return the photographs to map, by name with width and height, and those left out as copies of others.
+
+    Raises
+    ------
+    InputError
+        If they are too few, cannot be read, or are not those of the model.
+    """
+    names = [path.relative_to(folder).as_posix() for path in files]
+    copies = copies_among(folder, names) if without_copies else {}
+    names = [name for name in names if name not in copies]
+    check_number(folder, names, copies, model, min_images)
+    sizes = check_images(folder, names, model, say)
+    if without_copies:
+        copies |= smaller_copies(folder, sizes)
+        sizes = {name: size for name, size in sizes.items() if name not in copies}
+        check_number(folder, list(sizes), copies, model, min_images)
+    return sizes, copies
+
+
+def photographs_left_out(
+    folder: Path, files: Sequence[Path], copies: Mapping[str, str], used: Sequence[str], model_given: bool
+) -> list[str]:
+    """Say which photographs of a folder are not in a map, and why, a sentence for each reason."""
+    names = [path.relative_to(folder).as_posix() for path in files]
+    unread = [] if model_given else unread_photographs(folder, names)
+    rest = [name for name in names if name not in copies]
+    return [*unread, *copies_left_out(copies, len(names)), *images_left_out(rest, used, model_given)]
 
 
 def images_left_out(names: Sequence[str], used: Sequence[str], model_given: bool) -> list[str]:

@@ -21,14 +21,15 @@ from groma.adjustment.survey.objects import (
     pose_table,
     with_measured_points,
 )
-from groma.adjustment.survey.similarity import RobustSimilarity
+from groma.adjustment.survey.similarity import GATES, RobustSimilarity
 from groma.adjustment.survey.tables import control_tables, position_table
 from groma.adjustment.survey.triangulate import triangulated
 from groma.adjustment.terms.objects import name_of
+from groma.gates import NORMAL, chi_square_gate
 from groma.geometry import se3
 from groma.io.survey import WorldFrame, common_frame
 from groma.scene import Cameras, PosePriors, Scene, Similarity
-from groma.scene.survey import rejected_rows, with_rejected
+from groma.scene.survey import diagonal_covariance, rejected_rows, with_rejected
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +93,8 @@ def with_survey(scene: Scene, survey: Survey) -> Surveyed:
         known: BoolArray = np.asarray(np.isfinite(seen).all(axis=1))
         points = moved.control_points
         moved = moved.replace(control_points=points.replace(xyz=np.where(known[:, None], seen, points.measured)))
+    if found.fit is not None:
+        moved = _with_shown_noise(moved, survey, found.fit, notes)
     if len(moved.pose_priors) and survey.poses is not None:
         moved = moved.replace(pose_priors=PosePriors())  # the same poses, with the noise that is known
     elif len(moved.pose_priors) and found.fit is not None:
@@ -142,6 +145,36 @@ def _with_places(scene: Scene, survey: Survey, notes: list[str]) -> tuple[Scene,
     if survey.control is not None:
         tables["control_points"], tables["marks"] = control_tables(scene, survey, survey.control, places[-1], notes)
     return scene.replace(**tables), frame
+
+
+def _with_shown_noise(scene: Scene, survey: Survey, fit: RobustSimilarity, notes: list[str]) -> Scene:
+    """Return the scene whose positions have the noise that they show about its cameras, where nobody stated any.
+
+    What most of them agree on would be too little: receivers drift, and part of a flight is metres beside the rest. So
+    all that the usual noise allows for count. An error that all of them have in common does not show: they keep the
+    usual noise beside other measurements of where the scene is, and where they are too few, on a line or without
+    heights.
+    """
+    given, table = survey.positions, scene.camera_positions
+    if given is None or not given.usual_sigma or survey.position_sigma or np.isfinite(given.sigma).any():
+        return scene
+    residuals = fit.residuals[: len(table)]
+    usual = ((residuals / given.usual_sigma) ** 2).sum(axis=1) <= chi_square_gate(NORMAL.gross, 3)
+    residuals = residuals[usual]
+    spare = len(residuals) - 3  # derived from a similarity of level places: of seven three for heights
+    placed_otherwise = any(one is not None for one in (survey.control, survey.planes, survey.poses))
+    if spare < GATES.spare or fit.on_line or placed_otherwise:
+        return scene
+    east, north, up = np.sqrt((residuals**2).sum(axis=0) / [spare + 1, spare + 1, spare])
+    across = float(np.hypot(east, north) / np.sqrt(2.0))
+    notes.append(
+        f"{given.source} states no accuracy of the positions. They scatter about the cameras by {across:.2g} "
+        f"horizontally and {up:.2g} in height, which is taken as their noise. An error that all of them share does "
+        f"not show: the place of the whole scene is as uncertain as usual ({given.usual_sigma[0]:g}, "
+        f"{given.usual_sigma[2]:g})."
+    )
+    sigma = np.tile([across, across, up], (len(table), 1))
+    return scene.replace(camera_positions=table.replace(covariance=diagonal_covariance(sigma)))
 
 
 def _without_strays(scene: Scene, agrees: BoolArray) -> Scene:

@@ -33,6 +33,7 @@ class SimilarityGates:
     apart_deg: float = gate(10.0, "degrees", "by which directions differ if axes are doubted", "cost: a refused phone")
     parallel_deg: float = gate(10.0, "degrees", "from parallel, where lines have no width", "cost: a meaning")
     near_unit: float = gate(0.05, "share", "by which lengths may miss a factor of two units", "cost: a wrong hint")
+    spare: int = gate(8, "places", "to spare, from which a scatter is the noise of all", "derived from 25 % of it")
     better: float = gate(3.0, "times", "a fit must get with other axes, to name them", "chosen on random point sets")
 
 

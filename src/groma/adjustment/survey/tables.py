@@ -31,7 +31,7 @@ def position_table(scene: Scene, survey: Survey, xyz: FloatArray, notes: list[st
     notes += tell_partly(rows, given.names, scene.images.names, given.source)
     tell_unknown(given, rows, scene.images.names, notes)
     known = np.flatnonzero(np.asarray(rows) >= 0)
-    sigma = sigma_of(given, survey.position_sigma, "--position-sigma")
+    sigma = sigma_of(given, survey.position_sigma or given.usual_sigma, "--position-sigma")
     if (twice := len(known) - len(np.unique(rows[known]))) > 0:
         raise InputError(f"{given.source}: {counted(twice, 'images')} have two positions under different names.")
     return CameraPositions(rows[known], xyz[known], diagonal_covariance(sigma[known]))

@@ -91,6 +91,8 @@ class Places:
     source: str
     #: Sentences about what was read and what was assumed.
     notes: tuple[str, ...] = ()
+    #: Standard deviations of east, north and height that are usual where none are stated; empty: nothing is usual.
+    usual_sigma: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)

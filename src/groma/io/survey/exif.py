@@ -2,7 +2,8 @@
 """Positions that cameras wrote into their photographs: the GPS part of EXIF, of JPEG and TIFF files.
 
 Only what is asked for is read, at the head of a JPEG file and anywhere in a TIFF file, whose directories usually follow
-the pixels; damaged entries count as missing.
+the pixels; damaged entries count as missing. How accurate they are, telephones write into EXIF, and receivers with
+corrections into XMP: DJI as standard deviations of each coordinate, others in the words of Pix4D.
 
 Reference: CIPA DC-008, *Exchangeable image file format*, sections 4.5 and 4.6.6.
 """
@@ -11,8 +12,10 @@ from __future__ import annotations
 
 import mmap
 import os
+import re
 import struct
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -24,16 +27,22 @@ from groma.io.survey.coordinates import CoordinateSystem, Places
 #: Bytes of a JPEG file that are read: EXIF stands in one of the first segments, of 64 kB at most (cost: time only).
 _HEAD = 1 << 18
 #: Tags of the format.
-_GPS, _RATIONAL = 0x8825, 5
+_GPS, _XMP, _RATIONAL = 0x8825, 700, 5
+#: The tag of the horizontal error, metres, in the GPS part.
+_ERROR = 31
+#: Names of XMP for the standard deviations of east, north and height, metres.
+_STATED = ((b"RtkStdLon", b"RtkStdLat", b"RtkStdHgt"), (b"GPSXYAccuracy", b"GPSXYAccuracy", b"GPSZAccuracy"))
 #: First bytes of a TIFF file.
 _TIFF = (b"II*\0", b"MM\0*")
 #: Standard deviations of receivers in cameras and phones, metres: east, north, height (convention: of receivers without
 #: corrections).
 EXIF_SIGMA = (5.0, 5.0, 10.0)
+#: Of heights to those of east and north, where the horizontal one alone is written (convention: the same).
+_HEIGHTS = EXIF_SIGMA[2] / EXIF_SIGMA[0]
 
 
 def read_exif_positions(folder: str | os.PathLike[str], names: Sequence[str]) -> Places:
-    """Read the positions in the EXIF of photographs, with the accuracy usual for receivers in cameras.
+    """Read the positions in the EXIF of photographs, with the accuracy that is written there, if any is.
 
     Parameters
     ----------
@@ -47,14 +56,13 @@ def read_exif_positions(folder: str | os.PathLike[str], names: Sequence[str]) ->
     InputError
         If none has a position.
     """
-    found = {name: place for name in names if (place := position_of(Path(folder) / name)) is not None}
+    found = {name: place for name in names if (place := _position_of(Path(folder) / name)) is not None}
     if not found:
         raise InputError(
             f"None of the {len(names)} photographs in {folder} has a position in its EXIF. Give a file: --positions "
             "FILE."
         )
-    table = np.array(list(found.values()), float)
-    sigma = np.tile(np.array(EXIF_SIGMA), (len(table), 1))
+    table, sigma = np.array(list(found.values()), float).reshape(-1, 2, 3).swapaxes(0, 1).copy()
     notes = []
     if missing := len(names) - len(found):
         notes.append(f"{counted(missing, 'photographs')} without a position in the EXIF.")
@@ -63,11 +71,11 @@ def read_exif_positions(folder: str | os.PathLike[str], names: Sequence[str]) ->
         table[flat, 2] = np.median(table[~flat, 2]) if not flat.all() else 0.0
         sigma[flat, 2] = 1e4
         notes.append(f"{counted(int(flat.sum()), 'photographs')} without a height in the EXIF.")
-    return Places(tuple(found), table, sigma, CoordinateSystem("EPSG:4326"), "EXIF", tuple(notes))
+    return Places(tuple(found), table, sigma, CoordinateSystem("EPSG:4326"), "EXIF", tuple(notes), EXIF_SIGMA)
 
 
-def position_of(path: Path) -> tuple[float, float, float] | None:
-    """Return longitude, latitude (degrees) and height of a photograph; None without, NaN for a missing height."""
+def _position_of(path: Path) -> list[float] | None:
+    """Return longitude, latitude (degrees) and height, and their standard deviations in metres; NaN: not written."""
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD)
@@ -75,7 +83,7 @@ def position_of(path: Path) -> tuple[float, float, float] | None:
                 with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as whole:
                     return _position(whole)
         block = _exif_of(head)
-        return None if block is None else _position(block)
+        return None if block is None else _position(block, head)
     except (OSError, struct.error, ValueError, ZeroDivisionError):
         return None
 
@@ -93,7 +101,7 @@ def _exif_of(head: bytes) -> bytes | None:
     return None
 
 
-def _position(block: bytes | mmap.mmap) -> tuple[float, float, float] | None:
+def _position(block: bytes | mmap.mmap, xmp: bytes = b"") -> list[float] | None:
     order = "<" if block[:2] == b"II" else ">"
     main = _entries(block, order, struct.unpack_from(order + "I", block, 4)[0])
     if _GPS not in main:
@@ -114,7 +122,25 @@ def _position(block: bytes | mmap.mmap) -> tuple[float, float, float] | None:
     if 6 in gps:
         below = 5 in gps and block[gps[5][2]] == 1
         height = _rationals(block, order, gps[6], 1)[0] * (-1.0 if below else 1.0)
-    return degrees[0], degrees[1], height
+    sigma = [float("nan")] * 3
+    with suppress(struct.error, ValueError, ZeroDivisionError):
+        if _XMP in main:
+            start = struct.unpack_from(order + "I", block, main[_XMP][2])[0]
+            xmp = block[start : start + min(main[_XMP][1], _HEAD)]
+        error = _rationals(block, order, gps[_ERROR], 1)[0] if _ERROR in gps else float("nan")
+        sigma = _stated_in_xmp(xmp) or ([error, error, error * _HEIGHTS] if error > 0.0 else sigma)
+    return [*degrees, height, *sigma]
+
+
+def _stated_in_xmp(xmp: bytes) -> list[float]:
+    """Return the standard deviations of east, north and height that XMP states, metres; none where it states none."""
+    for names in _STATED:
+        found = [re.search(rb":%b\s*(?:=\s*[\"']|>)\s*\+?([0-9.eE/-]{1,24})\s*[\"'<]" % name, xmp) for name in names]
+        parts = [one[1].split(b"/") for one in found if one is not None]
+        sigma = [float(above) / float(below[0]) if below else float(above) for above, *below in parts]
+        if len(sigma) == 3 and all(0.0 < one < float("inf") for one in sigma):
+            return sigma
+    return []
 
 
 def _entries(block: bytes | mmap.mmap, order: str, offset: int) -> dict[int, tuple[int, int, int]]:
