@@ -30,7 +30,7 @@ def cells_elsewhere(
     there : (n, 2)
         Pixels that show the place, whatever else looks like it.
     some : (N,), optional
-        The matches of points that count; by default all.
+        The matches of points that count, beside any others; by default all.
     """
     camera = refined.camera
     both = cells_of(np.concatenate([matches.points2d, there]), camera, VERDICT.cells)
@@ -39,8 +39,7 @@ def cells_elsewhere(
     off = matches.points2d - expected
     agreeing = np.concatenate([cell[refined.point_inliers], shown])
     with np.errstate(invalid="ignore"):
-        away = (np.linalg.norm(off, axis=1) > beyond) & ~np.isin(cell, agreeing)
-    rows = np.flatnonzero(away if some is None else away & some)
+        rows = np.flatnonzero((np.linalg.norm(off, axis=1) > beyond) & ~np.isin(cell, agreeing))
     if len(rows) < 2:
         return 0
     side = max(camera.width, camera.height)
@@ -49,7 +48,8 @@ def cells_elsewhere(
     alike = (cell[first] != cell[second]) & (
         _length(off[first] - off[second]) <= VERDICT.bend * _length(pixels[first] - pixels[second])
     )
-    return len(np.unique(cell[np.concatenate([first[alike], second[alike]])]))
+    found = np.concatenate([first[alike], second[alike]])
+    return len(np.unique(cell[found if some is None else found[some[rows[found]]]]))
 
 
 def _length(vectors: FloatArray) -> FloatArray:
