@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What was measured of a map in a map that it was joined to: kept, moved, or left out and said."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from worlds import CAMERA
@@ -8,6 +10,8 @@ from worlds import CAMERA
 from groma.adjustment.terms.principal_points import near_the_middle
 from groma.geometry import quaternion, so3
 from groma.localization.joining.measurements import with_measurements_of
+from groma.localization.placed import PlacedImage
+from groma.localization.registered import with_queries
 from groma.scene import (
     CameraPositions,
     Cameras,
@@ -189,3 +193,22 @@ def test_lines_and_planes_that_cameras_measured_go_along(joint):
     np.testing.assert_allclose(out.line_depths.inverse_depth, [[0.1 / 0.4, 0.2 / 0.4]])
     assert (out.plane_observations.image_idx.tolist(), out.plane_observations.plane_idx.tolist()) == ([5], [3])
     np.testing.assert_allclose(out.plane_observations.plane_in_cam, [[0, 1, 0, -0.4]])
+
+
+def test_depths_of_a_map_stay_with_its_segments_beside_those_of_queries(joint):
+    segments = np.arange(8.0).reshape(2, 4)
+    scene = joint.replace(
+        lines=Lines.through(np.array([[[0.0, 0, 5], [1, 0, 5]]])),
+        line_observations=LineObservations([2, 0], [0, 0], segments, [1.0, 1.0]),
+        line_depths=LineDepths([0, 1], [[0.1, 0.2], [0.3, 0.4]], np.full((2, 2), 0.01), [0.5, 0.5]),
+    )
+    query = PlacedImage(
+        "new.jpg", "localized", "", np.array([0.0, 0, 0, 1, 0, 0, 0]), np.eye(6), "PINHOLE",
+        np.array([500.0, 500, 320, 240]), np.array([640, 480]), np.array([0]), np.ones((1, 2)), np.array([0]),
+        np.ones((1, 4)), 0.0,
+    )  # fmt: skip
+    out = with_queries(scene, SimpleNamespace(xyz=scene.points.xyz), [query])
+    assert out.line_observations.image_idx.tolist() == [2, 0, scene.num_images]
+    np.testing.assert_array_equal(out.line_observations.segment[out.line_depths.observation_idx], segments)
+    alone = out.subset([scene.num_images])
+    assert (len(alone.line_observations), len(alone.line_depths)) == (1, 0)

@@ -149,6 +149,9 @@ def test_another_place_is_the_more_probable_the_more_the_map_repeats_and_the_les
     assert place_not_in_map(40, 0, Shown()).odds == pytest.approx(5e-4)
     assert place_not_in_map(40, 20, Shown()).odds == pytest.approx(0.5, abs=1e-3)
     assert place_not_in_map(40, 90, Shown()).odds == pytest.approx(1.0, abs=1e-3)
+    # Where a place repeats, half of what agrees does: 4 of 23 are less than that by chance once in 770.
+    few = 4 / 23 * 2.0 * binom.cdf(4, 23, 0.5)
+    assert place_not_in_map(23, 4, Shown()).odds == pytest.approx(few + 5e-4, rel=1e-9)
     assert place_not_in_map(40, 0, Shown(found=(2, 0), expected=(12.0, 0.0))).odds > 0.01
     assert place_not_in_map(40, 40, Shown(found=(0, 18), expected=(0.0, 18.0))).odds < 1e-3
 
@@ -173,6 +176,17 @@ def test_what_is_found_at_a_place_that_is_known_is_no_piece_of_another():
             guided=lambda best, near=near: near,
             expected=lambda best, used, telling=telling: Shown(9.0, 0.0, (0, telling), (0.0, 20.0)),
         )
+        assert found.status == status, found.sentence
+
+
+def test_what_repeats_elsewhere_is_no_piece():
+    """The right half shows the map elsewhere, by landmarks that only one place has, or by others."""
+    world = make_world(np.random.default_rng(12), points=300)
+    right = world.points2d[:, 0] > CAMERA.width / 2
+    matches = Matches(world.points2d + right[:, None] * np.array([0.0, 150.0]), world.points3d)
+    for telling, status in ((np.ones(300, bool), "uncertain"), (~right, "localized"), (right, "uncertain")):
+        options = PoseOptions(look_for_rival=False)
+        found = pose_from_matches(CAMERA, matches, options, telling=lambda used, telling=telling: telling)
         assert found.status == status, found.sentence
 
 

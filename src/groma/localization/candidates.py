@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from groma._rows import numbered
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import together
 from groma.features.matching.wide_baseline import match_wide_baseline
@@ -66,6 +67,18 @@ class Candidates:
             index.line_covariance[line],
             shared_error=float(index.shared_error[int(len(line) > 0)]),
         )
+
+    def telling(self, query: DescribedImage, index: MapIndex) -> BoolArray:
+        """(n,) which of its points are more like a view of their point of the map than any other place is."""
+        kept = np.flatnonzero(index.telling[self.points[:, 1]] > 0.0)
+        here, there = self.points[kept].T
+        order, begin = index.views
+        owner, number = numbered(begin[there + 1] - begin[there])
+        view = index.descriptor[order[begin[there][owner] + number]]
+        far = np.linalg.norm(unit(view) - unit(query.points.descriptors[here])[owner], axis=1)
+        found = np.zeros(len(self.points), bool)
+        found[kept[owner[far <= index.within[there][owner]]]] = True
+        return found
 
 
 def points_alike(points: DescribedPoints, index: MapIndex, images: IntArray) -> list[IntArray]:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._log import log_warnings, logged_stages
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
 from groma.features.images import GrayImage, to_gray
 from groma.gates import gate
@@ -268,6 +268,9 @@ class Localizer:
             around = nearest_images(self.index, images, agreeing, self.options.gates.near)
             return shown_of(self.scene, self.index, self._again, around, best, used, alike, self.options.lines)
 
+        def telling(used: Matches) -> BoolArray:
+            return seen_in_them(used).telling(part, self.index)
+
         def common(best: Refined, used: Matches) -> FloatArray:
             if self._common is None:
                 return np.zeros((6, 6))
@@ -279,7 +282,9 @@ class Localizer:
             self.options.gates.near,
         )  # fmt: skip
         asked = MirrorQuestions(mirror.matches, closest)
-        pose = pose_from_matches(camera, matches, options, max(len(images), 1), guided, asked, expected, enough, common)
+        pose = pose_from_matches(
+            camera, matches, options, max(len(images), 1), guided, asked, expected, enough, common, telling
+        )
         return pose, seen_in_them(pose.matches)
 
     def _own_camera(self, camera: QueryCamera) -> int | None:

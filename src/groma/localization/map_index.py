@@ -108,6 +108,11 @@ class MapIndex:
         """(F,) lengths of the descriptors."""
         return lengths_of(self.descriptor)
 
+    @cached_property
+    def views(self) -> tuple[IntArray, IntArray]:
+        """(F,) rows of the views in the order of the points, and (P + 1,) where those of each point begin."""
+        return np.argsort(self.point, kind="stable"), np.searchsorted(np.sort(self.point), np.arange(len(self.xyz) + 1))
+
     def common_errors(self, scene: Scene) -> CommonErrors | None:
         """Return the errors of poses and calibrations of the map; None where nothing is told of them."""
         if not len(self.common):

@@ -13,7 +13,7 @@ from groma.localization.map_index import MapIndex
 from groma.localization.placed import PlacedImage
 from groma.scene import Cameras, Frames, Images, LineObservations, PointObservations, Points, Rigs, Scene, Sensors
 from groma.scene.camera import CAMERA
-from groma.scene.table import Table, joined
+from groma.scene.table import Table, joined, references
 
 
 def with_queries(scene: Scene, index: MapIndex, queries: Sequence[PlacedImage]) -> Scene:
@@ -39,7 +39,10 @@ def with_queries(scene: Scene, index: MapIndex, queries: Sequence[PlacedImage]) 
     )  # fmt: skip
     number = np.arange(scene.num_images, scene.num_images + len(queries))
     tables = {"points": points, **_images(scene, queries), **_seen(queries, number, row)}
-    return scene.replace(**{name: joined(getattr(scene, name), table) for name, table in tables.items()})
+    tables = {name: joined(getattr(scene, name), table) for name, table in tables.items()}
+    # What refers to rows of the map, like depths of its segments, still does: others come after them.
+    referring = {name: getattr(scene, name) for name, *_, target in references(Scene) if target in tables}
+    return scene.replace(**(referring | tables))
 
 
 def _images(scene: Scene, queries: Sequence[PlacedImage]) -> dict[str, Table]:

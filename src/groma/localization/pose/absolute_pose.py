@@ -198,6 +198,7 @@ def pose_from_matches(
     expected: Callable[[Refined, Matches], Shown] | None = None,
     enough: int = 0,
     common: Callable[[Refined, Matches], FloatArray] | None = None,
+    telling: Callable[[Matches], BoolArray] | None = None,
 ) -> AbsolutePose:
     """Estimate a pose as :func:`estimate_absolute_pose` does.
 
@@ -218,6 +219,8 @@ def pose_from_matches(
         A pose with fewer votes is of no interest: it is ``failed``, without asking what else speaks against it.
     common : callable, optional
         Returns what errors of the poses and calibrations of the map add to the covariance.
+    telling : callable, optional
+        Returns which matches of points show what only one place of the map has; by default all may.
     """
     options = options or PoseOptions()
     best = _best(camera, matches, options)
@@ -242,7 +245,7 @@ def pose_from_matches(
     if here.evidence.agree < enough:
         return _failed(camera, matches)
     other = _rival(matches, best, options, places, first) if options.look_for_rival and first.significant else None
-    here, there, others = weighed(here, other, near if guided else None, matches, expected is not None)
+    here, there, others = weighed(here, other, near if guided else None, matches, expected is not None, telling)
     return _judged(here, others, None if there is None else there.best.pose, matches, options, mirror, common)
 
 

@@ -10,13 +10,15 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import KDTree
 
-from groma._typing import FloatArray
+from groma._typing import BoolArray, FloatArray
 from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.refinement import Refined, cells_of
 
 
-def cells_elsewhere(refined: Refined, matches: Matches, beyond: float, there: FloatArray) -> int:
+def cells_elsewhere(
+    refined: Refined, matches: Matches, beyond: float, there: FloatArray, some: BoolArray | None = None
+) -> int:
     """Return how many cells of an image show the map elsewhere than a pose says, each like a cell beside it.
 
     Parameters
@@ -27,6 +29,8 @@ def cells_elsewhere(refined: Refined, matches: Matches, beyond: float, there: Fl
         Matches that are off by less, pixels, do not disagree for sure.
     there : (n, 2)
         Pixels that show the place, whatever else looks like it.
+    some : (N,), optional
+        The matches of points that count, beside any others; by default all.
     """
     camera = refined.camera
     both = cells_of(np.concatenate([matches.points2d, there]), camera, VERDICT.cells)
@@ -44,7 +48,8 @@ def cells_elsewhere(refined: Refined, matches: Matches, beyond: float, there: Fl
     alike = (cell[first] != cell[second]) & (
         _length(off[first] - off[second]) <= VERDICT.bend * _length(pixels[first] - pixels[second])
     )
-    return len(np.unique(cell[np.concatenate([first[alike], second[alike]])]))
+    found = np.concatenate([first[alike], second[alike]])
+    return len(np.unique(cell[found if some is None else found[some[rows[found]]]]))
 
 
 def _length(vectors: FloatArray) -> FloatArray:

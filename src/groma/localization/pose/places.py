@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from groma._typing import FloatArray
+from groma._typing import BoolArray, FloatArray
 from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pieces import cells_elsewhere
-from groma.localization.pose.refinement import Refined
+from groma.localization.pose.refinement import Refined, cells_of
 from groma.localization.pose.verdict import (
     Evidence,
     Instead,
@@ -36,9 +36,22 @@ class Place(NamedTuple):
     #: How much of what it says is there.
     shown: Shown = Shown()
 
-    def elsewhere(self, matches: Matches, there: FloatArray) -> int:
-        """How many cells show the map elsewhere, but for those of pixels (n, 2) that show this place."""
-        return cells_elsewhere(self.own, matches, VERDICT.distinct * max_errors(matches)[0], there)
+    def elsewhere(self, matches: Matches, there: FloatArray, some: BoolArray | None = None) -> int:
+        """How many cells show the map elsewhere, but for those of pixels (n, 2) that show this place; by some matches
+        (N,) of points, or all.
+        """
+        return cells_elsewhere(self.own, matches, VERDICT.distinct * max_errors(matches)[0], there, some)
+
+    def pieces(self, matches: Matches, telling: Callable[[Matches], BoolArray] | None) -> Instead:
+        """That the photograph is put together of pieces."""
+        there = self.used.points2d[self.best.point_inliers]
+        agree, elsewhere = self.evidence.agree, self.elsewhere(matches, there)
+        if not elsewhere or telling is None:
+            return pieces_of_others(agree, elsewhere, (agree, elsewhere))
+        some = telling(matches)
+        cells = cells_of(matches.points2d[some & self.own.point_inliers], self.best.camera, VERDICT.cells)
+        counts = int(cells.max(initial=-1)) + 1, self.elsewhere(matches, there, some)
+        return pieces_of_others(agree, elsewhere, counts)
 
 
 def weighed(
@@ -47,6 +60,7 @@ def weighed(
     near: Callable[[Refined], Place] | None,
     matches: Matches,
     in_map: bool,
+    telling: Callable[[Matches], BoolArray] | None = None,
 ) -> tuple[Place, Place | None, list[Instead]]:
     """Return the more probable one of two places, the other one, and what a photograph may show instead of the first.
 
@@ -62,6 +76,8 @@ def weighed(
         What was matched without a pose.
     in_map
         Whether these are all that a map has to say, so that a place which it does not have is told.
+    telling
+        Returns which matches of points show what only one place of the map has; None: all may.
     """
     agree, again = here.evidence.agree, here.elsewhere(matches, np.zeros((0, 2)))
     there, odds = None, 0.0
@@ -74,8 +90,7 @@ def weighed(
     unseen = place_not_in_map(agree, again, here.shown) if in_map else Instead(0.0, "")
     if near is not None and there is not None and odds > 1.0:
         here, there, odds, unseen = there, here, 1.0 / odds, unseen._replace(odds=unseen.odds / odds)
-    pieces = here.elsewhere(matches, here.used.points2d[here.best.point_inliers])
-    others = [unseen, pieces_of_others(here.evidence.agree, pieces)]
+    others = [unseen, here.pieces(matches, telling)]
     if there is not None:
         others.append(second_place(here.evidence, there.evidence, odds))
     return here, there, others

@@ -17,16 +17,20 @@ explain, :math:`k_1` cells speak for the first and :math:`k_2` for the second. I
 fall to either with the same probability; the odds of the second are what the sign test says.
 
 **A place that the map does not have.** Where things repeat, another place may look like this one: the odds are the
-share of what agrees that the map has elsewhere, too. What tells are points that look like no other place of the map
-(:mod:`groma.localization.repeated`). Of :math:`E` that are expected :math:`k` are found, at the place itself at the
-rate of all others, elsewhere at a share :math:`s` of it. Where several stand beside each other they are a thing that
-only this place has, and :math:`s` is small; one alone may be of a thing that repeats. Rates scatter from photograph to
-photograph as gamma variables of shape :math:`a` do, so that counts are negative binomial, and the odds are divided by
+share of what agrees that the map has elsewhere, too, times how likely so small a share is where half of what agrees
+repeats. What tells are points that look like no other place of the map (:mod:`groma.localization.repeated`). Of
+:math:`E` that are expected :math:`k` are found, at the place itself at the rate of all others, elsewhere at a share
+:math:`s` of it. Where several stand beside each other they are a thing that only this place has, and :math:`s` is
+small; one alone may be of a thing that repeats. Rates scatter from photograph to photograph as gamma variables of shape
+:math:`a` do, so that counts are negative binomial, and the odds are divided by
 
 .. math:: \prod s^{-k} \left(\frac{a + sE}{a + E}\right)^{a + k} .
 
-By the same number a second pose is weighed against the first. A pose is believed if it is right with high probability
-beside all of these.
+By the same number a second pose is weighed against the first.
+
+**Pieces.** A picture put together of pieces shows the map elsewhere in about as many cells as at the pose. So does a
+building that goes on beyond the map, but by what repeats. Counted are cells of what only one place of the map has, too,
+and the odds are the smaller ones. A pose is believed if it is right with high probability beside all of these.
 
 **The rest of the image.** What is to be seen under the pose is counted part by part of the image, by how often the map
 finds it again in its own images (:mod:`groma.localization.expected`). Where about as much is missing as is there, by
@@ -189,22 +193,25 @@ def second_place(first: Evidence, second: Evidence, odds: float) -> Instead:
     return Instead(odds, words)
 
 
-def pieces_of_others(agree: int, elsewhere: int) -> Instead:
-    """Return that a photograph is put together of pieces, some of which show the map elsewhere."""
+def pieces_of_others(agree: int, elsewhere: int, telling: tuple[int, int]) -> Instead:
+    """Return that a photograph is put together of pieces, some of which show the map elsewhere; ``telling`` are the
+    cells that agree, and those elsewhere, of what only one place has.
+    """
     words = (
         f"{agree} measurements speak for this place, and {elsewhere} cells of the image show the map where this place "
         "does not have it: it may repeat itself, or be put together of pieces."
     )
-    return Instead(float(_tail(elsewhere, agree)) if elsewhere else 0.0, words, elsewhere > agree)
+    odds = min(float(_tail(elsewhere, agree)), float(_tail(*telling[::-1]))) if elsewhere else 0.0
+    return Instead(odds, words, elsewhere > agree)
 
 
 def place_not_in_map(agree: int, again: int, shown: Shown) -> Instead:
     """Return that a place is shown which the map does not have; of the cells that agree it has so many ``again``."""
-    odds = min(again / max(agree, 1), 1.0) + 0.5 * (
-        1.0 - VERDICT.right
-    )  # where nothing repeats, half of what is allowed
+    again = min(again, agree)
+    odds = again / max(agree, 1) * float(_tail(again, agree - again))
+    odds += 0.5 * (1.0 - VERDICT.right)  # where nothing repeats, half of what is allowed
     words = (
-        f"{agree} measurements agree, of which the map has {min(again, agree)} elsewhere, too, and of points that look "
+        f"{agree} measurements agree, of which the map has {again} elsewhere, too, and of points that look "
         f"like no other place {sum(shown.found)} are found where {sum(shown.expected):.0f} are expected: it may be "
         "another place that looks like this one."
     )
