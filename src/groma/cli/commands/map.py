@@ -178,7 +178,9 @@ def map_(
         ("--keep-suspects", measured.keep_suspects and not measured, "on measurements (--positions, --control, ...)"),
         ("--truth", truth is not None and not contributions, "with --contributions, which compares with it"),
     )
-    console.begin_compilation("map")
+    from groma.compilation.ahead import mapping
+
+    console.begin_compilation(mapping(refine_poses))
     from groma.cli.shared.diagnosis import try_diagnosis
     from groma.cli.shared.extending import end_queries, extend_map
     from groma.cli.shared.mapping import run_map, say_map, stages_of_map, write_map
