@@ -22,6 +22,7 @@ from typing import Any
 from groma._kernels import cache as kernel_cache
 from groma.cli.main import run
 from groma.compilation import loading
+from groma.compilation.ahead import mapping
 from groma.compilation.needed import PLACE, Entry, function, points_of, read_type
 from groma.compilation.runs import ESTIMATED, HELD
 
@@ -47,11 +48,13 @@ def _adjust_points(folder: Path, model: str, is_estimated: bool) -> None:
 
 
 def _map(folder: Path) -> None:
+    run(["demo", "-o", str(folder / "demo"), "--quiet"])
+
+
+def _map_held(folder: Path) -> None:
     from groma.evaluation import cabinet
     from groma.io import read_scene, write_scene
 
-    run(["demo", "-o", str(folder / "demo"), "--quiet"])
-    # With poses held, segments are placed anew.
     write_scene(read_scene(cabinet.folder() / "model").subset(range(12)), folder / "model.npz")
     held = ["--model", str(folder / "model.npz"), "--fix-poses", "-o", str(folder / "held"), "--quiet"]
     run(["map", str(cabinet.folder() / "images"), *held])
@@ -100,7 +103,8 @@ def _selfcheck(folder: Path) -> None:
 #: Work that is known, and small instances of it.
 WORK: dict[str, Callable[[Path], None]] = {
     "adjust": _adjust,
-    "map": _map,
+    mapping(True): _map,
+    mapping(False): _map_held,
     "track": _track,
     "selfcheck": _selfcheck,
     "localize": _localize,

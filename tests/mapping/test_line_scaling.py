@@ -2,8 +2,10 @@
 """Mapping many lines: near pairs and lines seen side by side against comparisons of all; unused landmarks; words."""
 
 import inspect
+import itertools
 import re
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from _comparison import equal
 from groma.cli.commands.map import map_
 from groma.features.segments import SEGMENTS
 from groma.mapping.groups import distinct_pairs, num_distinct
+from groma.mapping.lines.bins import in_bins
 from groma.mapping.lines.hypotheses.known_points import lines_through_points
 from groma.mapping.lines.line_map import LineMap, explain
 from groma.mapping.lines.linking import merge as _line_merge
@@ -148,10 +151,21 @@ def test_lines_that_an_image_shows_side_by_side():
     line = np.column_stack([np.zeros(5), np.ones(5), -ends[:, 1]])
     rows = np.argsort(line_of, kind="stable")
     pointers = np.searchsorted(line_of[rows], np.arange(5))
+    tracks: Any = SimpleNamespace(
+        views=SimpleNamespace(image_idx=image, ends=ends, line=line), table=lambda: (rows, pointers)
+    )
     pairs = np.array([[0, 1], [1, 0], [0, 2], [0, 3]])
-    apart = np.zeros(len(pairs), bool)
-    _line_merge._apart(pairs, pointers, rows, image, ends, line, 0.3, 1.0, apart)
-    assert apart.tolist() == [True, True, False, False]
+    assert _line_merge.seen_apart(tracks, pairs).tolist() == [True, True, False, False]
+    assert _line_merge.seen_apart(tracks, pairs[:0]).tolist() == []
+
+
+@pytest.mark.kernels
+def test_intervals_are_in_all_bins_that_they_cover():
+    """On a circle of five bins: inside one, across two, across the end, and more than once around."""
+    members, pointers = in_bins(np.array([[0.2, 0.4], [1.5, 2.5], [4.5, 5.5], [3.0, 9.0]]), 1.0, 5)
+    found = [members[a:b].tolist() for a, b in itertools.pairwise(pointers)]
+    assert found == [[0, 2, 3], [1, 3], [1, 3], [3], [2, 3]]
+    assert len(in_bins(np.zeros((0, 2)), 1.0, 5)[0]) == 0
 
 
 def test_distinct_pairs():

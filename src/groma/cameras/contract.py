@@ -18,6 +18,7 @@ from groma._numba import loop
 from groma._typing import FloatArray
 from groma.cameras.dispatch import (
     has_pinhole_kernels,
+    has_wrap_kernel,
     pinhole_parameters,
     pinhole_parameters_jacobian,
     project,
@@ -225,7 +226,9 @@ class CameraModel:
     def pixel_difference(self, params: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
         """Return ``first - second`` (N, 2), in a panorama the short way round; arguments as in :meth:`unproject`."""
         difference = as_rows(first, (2,), "first") - as_rows(second, (2,), "second")
-        _wrap_all(self.tag, self.check_parameters(params, len(difference)), difference)
+        rows = self.check_parameters(params, len(difference))
+        if has_wrap_kernel(self.number + 1):
+            _wrap_all(self.tag, rows, difference)
         return difference
 
     def focal_length(self, params: FloatArray) -> FloatArray:

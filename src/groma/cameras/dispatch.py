@@ -138,6 +138,11 @@ def kernel_module(length: int) -> str:
     return _PROJECT[length].__module__
 
 
+def has_wrap_kernel(length: int) -> bool:
+    """Whether a tag of ``length`` selects a model in whose images opposite borders are the same place."""
+    return _WRAP[length] is not _leave
+
+
 def has_pinhole_kernels(length: int) -> bool:
     """Whether a tag of ``length`` selects a model without distortion."""
     return length in _PINHOLE

@@ -81,6 +81,11 @@ class Ahead:
 _expected: list[Ahead] = []
 
 
+def mapping(refines_poses: bool) -> str:
+    """Return the name of the work of mapping photographs; where poses are held, segments are placed anew."""
+    return "map" if refines_poses else "map, poses held"
+
+
 def begin(work: str, announce: Callable[[], None], threads: int | None = None) -> None:
     """Expect some work, and let processes begin with what it needs if nothing was ever compiled."""
     end()

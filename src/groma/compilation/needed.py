@@ -22,6 +22,7 @@ PLACE = Path(__file__).with_name("needed.json")
 #: What each kind of work imports: parts that compiled functions choose by number are registered there.
 IMPORTS = {
     "adjust": "groma.adjustment.adjust",
+    "adjust points": "groma.adjustment.adjust",
     "map": "groma.mapping.map",
     "track": "groma.tracking",
     "selfcheck": "groma.factors",
@@ -52,7 +53,7 @@ def adjusting(models: Iterable[str], is_estimated: bool, has_points_alone: bool)
 
 def imported(work: str) -> str | None:
     """Return the module that some work imports."""
-    return IMPORTS.get("adjust" if work.startswith(_POINTS) else work)
+    return IMPORTS.get(work.partition(",")[0])
 
 
 def needed(work: str) -> list[Entry]:

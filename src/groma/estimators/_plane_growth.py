@@ -12,9 +12,9 @@ from groma._numba import loop
 from groma._ordering import copy, median
 from groma._trees import nearest_in_order
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.estimators._plane_candidates import Features
+from groma.estimators._plane_candidates import Features, squares
 from groma.estimators._plane_loops import (
-    ball_loop,
+    BALL,
     connected_loop,
     connected_part_loop,
     fit_loop,
@@ -245,7 +245,7 @@ class Grower:
         height, spread, precision, weight = buffers.numbers[:4, :inner]
         reach = math.sqrt(self._gate) * spread
         edges = self._edges(layer[np.abs(height) < reach], labels)
-        alarm = self._log10_false_alarms(plane, np.concatenate([rows, edges]), buffers.mark)
+        alarm = self._log10_false_alarms(plane, np.concatenate([rows, edges]))
         even = _log10_even(height, reach, band)
         if features.rough:  # some thicker layer stands out by chance
             even += self._log_tried
@@ -258,15 +258,25 @@ class Grower:
         taken = np.union1d(rows, layer[labels[layer] < 0])
         return Grown(fit, share, band, alarm, features.places[rows], taken), plane, rows
 
-    def _log10_false_alarms(self, plane: FloatArray, rows: IntArray, mark: IntArray) -> float:
+    def _log10_false_alarms(self, plane: FloatArray, rows: IntArray) -> float:
         """Number of planes tried on which as much would lie by chance, of what is in a ball around it, log10."""
         features, places = self._features, self._features.places
         center = places[rows].mean(axis=0)
         radius = float(np.quantile(norm(places[rows] - center), GATES.extent))
-        inside, number, chance = ball_loop(
-            places, features.packed, features.carrier, features.balls, rows, center, radius, plane, self._gate, mark
-        )
-        return log10_binomial_tail(inside - 4, number - 3, chance / max(number, 1)) + self._log_tried  # three fix it
+        balls = np.flatnonzero(norm(features.balls[:, :3] - center) <= radius + features.balls[:, 3])
+        near = (BALL * balls[:, None] + np.arange(BALL)).ravel()
+        near = near[near < len(places)]
+        near = near[norm(places[near] - center) < radius]
+        on = np.zeros(len(places), bool)
+        on[np.intersect1d(rows, near)] = True
+        carrier = features.carrier[near]
+        support = on[near] & ~((carrier >= 0) & on[carrier])
+        counted = near[support | (carrier < 0)]  # carried points say nothing of their own
+        spread = np.sqrt(np.maximum(features.packed[counted] @ squares(plane[:3]), 1e-300))
+        shares = np.minimum(math.sqrt(self._gate) * spread / max(radius, 1e-300), 1.0)
+        chance = float(shares.sum()) / max(len(counted), 1)
+        inside = int(np.count_nonzero(support))
+        return log10_binomial_tail(inside - 4, len(counted) - 3, chance) + self._log_tried  # three fix it
 
     def _edges(self, on: IntArray, labels: IntArray) -> IntArray:
         """Of what lies on a plane, both ends of segments that were taken out with others: an edge is on two faces."""

@@ -47,29 +47,28 @@ def least_axis_kernel(A, V):
     for i in range(3):
         for j in range(3):
             V[i, j] = 1.0 if i == j else 0.0
-    for _ in range(_SWEEPS):
+    for step in range(3 * _SWEEPS):
         beside = A[0, 1] ** 2 + A[0, 2] ** 2 + A[1, 2] ** 2
         if not beside > 1e-33 * (A[0, 0] ** 2 + A[1, 1] ** 2 + A[2, 2] ** 2):
             break
-        for p in range(2):
-            for q in range(p + 1, 3):
-                if A[p, q] == 0.0:
-                    continue
-                turn = (A[q, q] - A[p, p]) / (2.0 * A[p, q])
-                t = 1.0 / (abs(turn) + math.sqrt(turn * turn + 1.0))
-                if turn < 0.0:
-                    t = -t
-                c = 1.0 / math.sqrt(t * t + 1.0)
-                s = t * c
-                for k in range(3):
-                    a, b = A[k, p], A[k, q]
-                    A[k, p], A[k, q] = c * a - s * b, s * a + c * b
-                for k in range(3):
-                    a, b = A[p, k], A[q, k]
-                    A[p, k], A[q, k] = c * a - s * b, s * a + c * b
-                for k in range(3):
-                    a, b = V[k, p], V[k, q]
-                    V[k, p], V[k, q] = c * a - s * b, s * a + c * b
+        p, q = step % 3 // 2, 1 + (step % 3 + 1) // 2
+        if A[p, q] == 0.0:
+            continue
+        turn = (A[q, q] - A[p, p]) / (2.0 * A[p, q])
+        t = 1.0 / (abs(turn) + math.sqrt(turn * turn + 1.0))
+        if turn < 0.0:
+            t = -t
+        c = 1.0 / math.sqrt(t * t + 1.0)
+        s = t * c
+        for k in range(3):
+            a, b = A[k, p], A[k, q]
+            A[k, p], A[k, q] = c * a - s * b, s * a + c * b
+        for k in range(3):
+            a, b = A[p, k], A[q, k]
+            A[p, k], A[q, k] = c * a - s * b, s * a + c * b
+        for k in range(3):
+            a, b = V[k, p], V[k, q]
+            V[k, p], V[k, q] = c * a - s * b, s * a + c * b
     least = 0
     for k in range(1, 3):
         if A[k, k] < A[least, least]:
@@ -277,35 +276,3 @@ def connected_part_loop(places, spacing, partner, carrier, neighbours, rows, hel
     for k in range(number):
         mark[rows[k]] = -1
     return count, independent
-
-
-@loop
-def ball_loop(places, packed, carrier, balls, rows, center, radius, plane, gate, mark):
-    """Support in a ball, all that is there, and how much of it is in the layer by chance; no carried points."""
-    squared = radius * radius
-    for k in range(len(rows)):
-        i = rows[k]
-        x, y, z = places[i, 0] - center[0], places[i, 1] - center[1], places[i, 2] - center[2]
-        if x * x + y * y + z * z < squared:
-            mark[i] = 0
-    inside = number = 0
-    chance = 0.0
-    for b in range(len(balls)):
-        x, y, z = balls[b, 0] - center[0], balls[b, 1] - center[1], balls[b, 2] - center[2]
-        if x * x + y * y + z * z > (radius + balls[b, 3]) ** 2:
-            continue
-        for i in range(b * BALL, min((b + 1) * BALL, len(places))):
-            carried = carrier[i] >= 0
-            support = mark[i] >= 0 and not (carried and mark[carrier[i]] >= 0)
-            if carried and not support:
-                continue
-            x, y, z = places[i, 0] - center[0], places[i, 1] - center[1], places[i, 2] - center[2]
-            if not x * x + y * y + z * z < squared:
-                continue
-            inside += support
-            number += 1
-            spread = math.sqrt(max(variance_kernel(packed[i], plane[0], plane[1], plane[2]), 1e-300))
-            chance += min(math.sqrt(gate) * spread / max(radius, 1e-300), 1.0)
-    for k in range(len(rows)):
-        mark[rows[k]] = -1
-    return inside, number, chance

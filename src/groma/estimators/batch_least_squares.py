@@ -165,42 +165,51 @@ def _solve_all(
     trial_H, trial_g = np.zeros((size, size)), np.zeros(size)
     for n in range(len(pointers) - 1):
         begin, end, here, frame = pointers[n], pointers[n + 1], x[n], B[n]
-        damping = FIRST_DAMPING
-        _frame(kind, here, frame)
-        before = _linearize(
-            kind, shared, index, own, begin, end, active, here, frame, cauchy, r, J, H, g, parameters, rows
-        )
-        while steps[n] < max_steps:
-            steps[n] += 1
-            done = better = False
-            for _ in range(MAX_ATTEMPTS):
-                better, after = False, before
-                if solve_damped(H, g, damping, L, step, parameters):
-                    _move(kind, here, frame, step, trial)
-                    _frame(kind, trial, trial_frame)
-                    # Most steps are accepted, so the trial is linearised at once.
-                    after = _linearize(
-                        kind, shared, index, own, begin, end, active, trial, trial_frame, cauchy, r, J,
-                        trial_H, trial_g, parameters, rows,
-                    )  # fmt: skip
-                    better = after <= before
-                    done = after >= before * (1.0 - tolerance) - floor
-                if better:
-                    for k in range(trial.size):
-                        here.flat[k] = trial.flat[k]
-                    for k in range(trial_frame.size):
-                        frame.flat[k] = trial_frame.flat[k]
-                    H, trial_H, g, trial_g, before = trial_H, H, trial_g, g, after
-                    damping = max(damping * 0.1, MIN_DAMPING)
-                    break
-                damping *= 10.0
-            if done or not better:
-                converged[n] = done
+        damping, before, attempts, first, done, ended = FIRST_DAMPING, np.inf, 0, True, False, False
+        for k in range(trial.size):
+            trial.flat[k] = here.flat[k]
+        while True:
+            # The start, then trials, which are linearised at once, as most are accepted; in the end without the loss.
+            _frame(kind, trial, trial_frame)
+            after = _linearize(
+                kind, shared, index, own, begin, end, active, trial, trial_frame, 0.0 if ended else cauchy, r, J,
+                trial_H, trial_g, parameters, rows,
+            )  # fmt: skip
+            better = first or ended or after <= before
+            done = not first and after >= before * (1.0 - tolerance) - floor
+            if better:
+                for k in range(trial.size):
+                    here.flat[k] = trial.flat[k]
+                for k in range(trial_frame.size):
+                    frame.flat[k] = trial_frame.flat[k]
+                H, trial_H, g, trial_g, before = trial_H, H, trial_g, g, after
+            if ended:
                 break
-        if cauchy > 0.0:
-            before = _linearize(
-                kind, shared, index, own, begin, end, active, here, frame, 0.0, r, J, H, g, parameters, rows
-            )
+            if not better:
+                damping *= 10.0
+            else:
+                if not first:
+                    damping = max(damping * 0.1, MIN_DAMPING)
+                converged[n], ended = done, done or steps[n] >= max_steps
+                if not ended:
+                    steps[n] += 1
+                    attempts, done = 0, False
+            first = solved = False
+            while not (solved or ended):
+                if attempts == MAX_ATTEMPTS:
+                    converged[n], ended = done, True
+                    break
+                attempts += 1
+                solved = solve_damped(H, g, damping, L, step, parameters)
+                if not solved:
+                    damping *= 10.0
+            if solved:
+                _move(kind, here, frame, step, trial)
+            elif cauchy > 0.0:
+                for k in range(trial.size):
+                    trial.flat[k] = here.flat[k]
+            else:
+                break
         cost[n] = before
         for a in range(size):
             for b in range(a + 1):

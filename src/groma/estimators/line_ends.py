@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._numba import kernel, loop
-from groma._ordering import ascending, median
+from groma._ordering import ascending, copy, median
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.batch_least_squares import PROBLEMS_AT_ONCE
 from groma.execution import map_ranges
@@ -56,36 +56,38 @@ def _along(center, ray, X):
 
 
 @kernel
-def _seen_twice(first, last):
-    """From where to where at least two of the intervals cover a line; empty (inf, -inf) if no two overlap."""
-    count = len(first)
-    by_first, by_last = ascending(first), ascending(last)
-    depth, low, high = 0, np.inf, -np.inf
-    i = j = 0
-    while j < count:
-        if i < count and first[by_first[i]] <= last[by_last[j]]:
+def _seen_twice(ends, order, limits):
+    """Write from where to where at least two of the intervals cover a line, minus the former; -inf if no two overlap.
+
+    ``ends`` (2, count) are minus the lower ends of intervals and their upper ends, ``order`` sorts each, falling.
+    """
+    count = ends.shape[1]
+    limits[0], limits[1] = -np.inf, -np.inf
+    depth = i = 0
+    j = count - 1
+    while j >= 0:
+        if i < count and -ends[0, order[0, i]] <= ends[1, order[1, j]]:
             depth += 1
             if depth == 2:
-                low = min(low, first[by_first[i]])
+                limits[0] = max(limits[0], ends[0, order[0, i]])
             i += 1
         else:
             if depth == 2:
-                high = max(high, last[by_last[j]])
+                limits[1] = max(limits[1], ends[1, order[1, j]])
             depth -= 1
-            j += 1
-    return low, high
+            j -= 1
 
 
 @kernel
-def _end_of(last, size, limit, stop, gates):
+def _end_of(last, order, size, usual, limit, stop, gates):
     """The upper end of a line from the upper ends of its segments and the size of a pixel of each, along the line.
 
-    ``limit`` is as far as two images see; the end is not below ``stop``.
+    ``order`` sorts the ends, falling, and ``usual`` is the median size. ``limit`` is as far as two images see; the end
+    is not below ``stop``.
     """
     same_end, majority, quantile = gates
     count = len(last)
     place = limit
-    order = ascending(-last)
     for k in order:
         if last[k] > limit:
             continue
@@ -102,7 +104,7 @@ def _end_of(last, size, limit, stop, gates):
             break
         if majority * beyond > count:
             break
-    reach = same_end * median(size)
+    reach = same_end * usual
     total = 0.0
     for k in order:
         if abs(last[k] - place) <= reach:
@@ -119,9 +121,11 @@ def _end_of(last, size, limit, stop, gates):
 @loop
 def _trim_all(center, image, ray, length, pointers, rows, active, gates, X, front):
     """Loop of :func:`trim`."""
+    limits = np.empty(2)
     for n in range(len(pointers) - 1):
         begin, end = pointers[n], pointers[n + 1]
-        low_ends, high_ends, sizes = np.empty(end - begin), np.empty(end - begin), np.empty(end - begin)
+        ends, rising, size = np.empty((2, end - begin)), np.empty((2, end - begin)), np.empty(end - begin)
+        order = np.empty((2, end - begin), np.int64)
         count = 0
         for m in range(begin, end):
             s = rows[m]
@@ -129,19 +133,23 @@ def _trim_all(center, image, ray, length, pointers, rows, active, gates, X, fron
             t1, z1 = _along(center[image[s]], ray[s, 1], X[n])
             front[m] = z0 > 0.0 and z1 > 0.0
             if active[m] and front[m]:
-                low_ends[count], high_ends[count] = min(t0, t1), max(t0, t1)
-                sizes[count] = max(abs(t1 - t0) / length[s], 1e-12)
+                low, high = min(t0, t1), max(t0, t1)
+                ends[0, count], ends[1, count], rising[0, count], rising[1, count] = -low, high, low, -high
+                size[count] = max(abs(t1 - t0) / length[s], 1e-12)
                 count += 1
-        first, last, size = low_ends[:count], high_ends[:count], sizes[:count]
-        low, high = _seen_twice(first, last)
-        if low < high:
-            middle = 0.5 * (low + high)
-            high_end = _end_of(last, size, high, middle, gates)
-            low_end = -_end_of(-first, size, -low, -middle, gates)
-            a0, a1, a2 = X[n, 0, 0], X[n, 0, 1], X[n, 0, 2]
-            d0, d1, d2 = X[n, 1, 0] - a0, X[n, 1, 1] - a1, X[n, 1, 2] - a2
-            X[n, 0, 0], X[n, 0, 1], X[n, 0, 2] = a0 + low_end * d0, a1 + low_end * d1, a2 + low_end * d2
-            X[n, 1, 0], X[n, 1, 1], X[n, 1, 2] = a0 + high_end * d0, a1 + high_end * d1, a2 + high_end * d2
+        for side in range(2):
+            copy(ascending(rising[side, :count]), order[side, :count])
+        _seen_twice(ends[:, :count], order, limits)
+        if -limits[0] < limits[1]:
+            middle, usual = 0.5 * (limits[1] - limits[0]), median(size[:count])
+            for side in range(2):
+                stop = middle if side else -middle
+                limits[side] = _end_of(
+                    ends[side, :count], order[side, :count], size, usual, limits[side], stop, gates
+                )  # fmt: skip
+            for c in range(3):
+                a, d = X[n, 0, c], X[n, 1, c] - X[n, 0, c]
+                X[n, 0, c], X[n, 1, c] = a - limits[0] * d, a + limits[1] * d
 
 
 @dataclass(frozen=True)

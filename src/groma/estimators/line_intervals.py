@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from groma._numba import kernel, loop
-from groma._ordering import ascending, median, sort_by
+from groma._ordering import ascending, median
 from groma._rows import numbered
 from groma._typing import FloatArray, IntArray
 from groma.estimators.line_ends import LINE_ENDS
@@ -36,9 +36,17 @@ def _joined(image, low, high, size, same_end):
     """Join the segments of one image across gaps within the noise of ends; return image, start, end of each piece."""
     count = len(image)
     owner, first, last = np.empty(count, np.int64), np.empty(count), np.empty(count)
+    order = np.empty(count, np.int64)
+    for k in range(count):  # they are few, and mostly come by image
+        m = k
+        while m > 0:
+            before = order[m - 1]
+            if image[before] < image[k] or (image[before] == image[k] and low[before] <= low[k]):
+                break
+            order[m] = before
+            m -= 1
+        order[m] = k
     found = 0
-    order = ascending(low)
-    sort_by(image, order)
     for k in order:
         if found and owner[found - 1] == image[k] and low[k] <= last[found - 1] + same_end * size[k]:
             last[found - 1] = max(last[found - 1], high[k])

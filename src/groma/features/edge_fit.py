@@ -160,12 +160,14 @@ def _mean_gradient(image, u1, v1, u2, v2, dx, dy, count):
 @inline_kernel
 def _robust_line(s, e, w, spread, n, outlier, line):
     """Fit offsets e at places s by a line, with weights w that let go of what is far; False where it fails."""
-    # Start from the median offset: half of the samples may belong to a neighbouring edge.
-    line[0], line[1] = median(e[:n]), 0.0
-    for _ in range(4):
+    for step in range(5):
         for k in range(n):
-            spread[k] = abs(e[k] - line[0] - line[1] * s[k])
-        cut = outlier * max(SIGMA_OF_MEDIAN * median(spread[:n]), 0.05)
+            spread[k] = abs(e[k] - line[0] - line[1] * s[k]) if step else e[k]
+        middle = median(spread[:n])
+        if step == 0:  # start from the median offset: half of the samples may belong to a neighbouring edge
+            line[0], line[1] = middle, 0.0
+            continue
+        cut = outlier * max(SIGMA_OF_MEDIAN * middle, 0.05)
         for k in range(n):
             ratio = spread[k] / cut
             w[k] = (1.0 - ratio * ratio) ** 2 if ratio < 1.0 else 0.0

@@ -60,7 +60,8 @@ def weigh(record, begin, scale, step, loss_tag, parameters, norms):
 
 
 @loop
-def cost_scaled(residual, begin, scale, step, loss_tag, parameters, rho):
+def cost_scaled(residual, begin, scale, step, loss_tag, parameters, landmark, costs):
+    """Return the sum of rho; half of each is added to the cost of its landmark, where there are such costs."""
     n, m = residual.shape
     cost = 0.0
     for i in range(n):
@@ -69,13 +70,15 @@ def cost_scaled(residual, begin, scale, step, loss_tag, parameters, rho):
         for a in range(m):
             norm += residual[i, a] * residual[i, a]
         value = loss_value(loss_tag, parameters, norm * s * s)
-        rho[i] = value
+        if len(costs):
+            costs[landmark[begin + i]] += 0.5 * value
         cost += value
     return cost
 
 
 @loop
-def cost_whitened(residual, begin, information, loss_tag, parameters, rho):
+def cost_whitened(residual, begin, information, loss_tag, parameters, landmark, costs):
+    """As :func:`cost_scaled`, of residuals with square root information matrices."""
     n, m = residual.shape
     cost = 0.0
     for i in range(n):
@@ -86,7 +89,8 @@ def cost_whitened(residual, begin, information, loss_tag, parameters, rho):
                 total += information[begin + i, a, b] * residual[i, b]
             norm += total * total
         value = loss_value(loss_tag, parameters, norm)
-        rho[i] = value
+        if len(costs):
+            costs[landmark[begin + i]] += 0.5 * value
         cost += value
     return cost
 
@@ -102,15 +106,3 @@ def chain_rule(record, begin, raw, column, index, basis, raw_width, dof_width, o
         for a in range(m):
             row = (i * m + a) * columns
             set_product(flat, row + column, flat, row + raw, 1, bases, b, dof, raw_width, one, dof_width)
-
-
-@loop
-def mask(record, begin, column, index, free):
-    """Zero the columns of coordinates that are held constant."""
-    n, m, _ = record.shape
-    for i in range(n):
-        k = index[begin + i]
-        for c in range(free.shape[1]):
-            if not free[k, c]:
-                for a in range(m):
-                    record[i, a, column + c] = 0.0

@@ -82,15 +82,3 @@ def add_cross(record, begin, block_a, column_a, block_b, column_b, slot, same_cl
             add_product(H, target, flat, at_a, columns, flat, at_b, columns, rows, a_width, b_width)
         if same_class and a >= b:
             add_product(H, target, flat, at_b, columns, flat, at_a, columns, rows, b_width, a_width)
-
-
-@loop
-def add_costs(rho, begin, landmark, costs):
-    """Add half of the sum over each landmark's factors, which follow each other, to its cost."""
-    total = 0.0
-    for i in range(len(rho)):
-        p = landmark[begin + i]
-        total += rho[i]
-        if i + 1 == len(rho) or landmark[begin + i + 1] != p:
-            costs[p] += 0.5 * total
-            total = 0.0

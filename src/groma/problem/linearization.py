@@ -19,13 +19,15 @@ import numpy as np
 
 from groma._simd import width_for
 from groma._typing import FloatArray
-from groma.problem._records import chain_rule, cost_scaled, cost_whitened, mask, weigh, whiten
+from groma.problem._records import chain_rule, cost_scaled, cost_whitened, weigh, whiten
 from groma.problem._room import room_for_chunks, room_for_sums
-from groma.problem._sums import add_block, add_costs, add_cross, add_incidence, add_primary
+from groma.problem._sums import add_block, add_cross, add_incidence, add_primary
 from groma.problem.layout import CHUNK_SIZE, Chunk, FactorLayout, Layout, in_runs
 from groma.problem.parallel import COSTS_IN_THREADS, LINEARISED_IN_THREADS, Workers, shares_of, sum_of
 
 States = Mapping[str, FloatArray]
+#: Where costs of landmarks are not asked for.
+_NO_COSTS = np.empty(0)
 
 
 class Noise:
@@ -76,13 +78,13 @@ class NormalEquations:
         self._scratch = threading.local()  # one per thread, not per share: it stays in cache
         self._references = [tuple(ref for _, ref in factor.factor.references()) for factor in layout.factors]
         self._known: dict[str, tuple[FloatArray, FloatArray]] = {}
-        self._free = {}
+        self._held = {}
         for factor, references in zip(layout.factors, self._references, strict=True):
-            for name in {references[reference].group for reference, _, _ in factor.masked} - self._free.keys():
+            for name in {references[reference].group for reference, _, _ in factor.masked} - self._held.keys():
                 free = layout.problem.variables[name].free_coordinates()
                 assert free is not None
                 order = next((e.order for e in layout.eliminated if e.group == name), None)
-                self._free[name] = np.ascontiguousarray(free if order is None else free[order])
+                self._held[name] = ~(free if order is None else free[order])
         self.V, self.g_landmarks, self.W = room_for_sums(layout, compact)
         self._chunk_W: list[list[dict[int, Any]]] = [
             room_for_chunks(layout) if compact else self.W for _ in self.shares
@@ -140,12 +142,11 @@ class NormalEquations:
         def work(share: int) -> tuple[list[float], list[int]]:
             sums, hidden = [0.0] * len(self.layout.factors), [0] * len(self.layout.factors)
             for f, begin, end in self._runs_of_all(share) if wanted is None else self._runs(share, wanted):
-                value, rho, degenerate = self._chunk_cost(f, inputs[f], begin, end)
+                e = self.layout.factors[f].eliminated
+                costs = _NO_COSTS if landmark_costs is None or e is None else landmark_costs[e]
+                value, degenerate = self._chunk_cost(f, inputs[f], begin, end, costs)
                 sums[f] += value
                 hidden[f] += degenerate
-                layout = self.layout.factors[f]
-                if landmark_costs is not None and layout.eliminated is not None:
-                    add_costs(rho, begin, layout.landmark, landmark_costs[layout.eliminated])
             return sums, hidden
 
         parts = self.workers.map(work, len(self.shares), self._is_little(wanted, COSTS_IN_THREADS))
@@ -192,18 +193,17 @@ class NormalEquations:
                 self.costs[f], self.hidden[f] = costs[f], hidden[f]
         return float(sum(self.costs))
 
-    def _chunk_cost(self, f: int, inputs: tuple, begin: int, end: int) -> tuple[float, FloatArray, int]:
+    def _chunk_cost(self, f: int, inputs: tuple, begin: int, end: int, costs: FloatArray) -> tuple[float, int]:
+        """Return the cost of factors, and how many are degenerate; add to the costs of their landmarks."""
         layout, noise = self.layout.factors[f], self._noise[f]
         n, m = end - begin, layout.factor.residual_size
-        flat = self._record(f)
-        out = flat[: n * m].reshape(n, m)
-        rho = flat[n * m : n * m + n]
+        out = self._record(f)[: n * m].reshape(n, m)
         degenerate = layout.factor.residuals(inputs, begin, end, out)
         if noise.matrices is not None:
-            value = cost_whitened(out, begin, noise.matrices, *noise.loss, rho)
+            value = cost_whitened(out, begin, noise.matrices, *noise.loss, layout.landmark, costs)
         else:
-            value = cost_scaled(out, begin, noise.scale, noise.step, *noise.loss, rho)
-        return value, rho, degenerate
+            value = cost_scaled(out, begin, noise.scale, noise.step, *noise.loss, layout.landmark, costs)
+        return value, degenerate
 
     def _record(self, f: int) -> FloatArray:
         scratch = self._scratch.__dict__.setdefault("records", {})
@@ -318,7 +318,8 @@ class NormalEquations:
             )  # fmt: skip
         for reference, column, _ in layout.masked:
             ref = references[reference]
-            mask(record, begin, column, ref.index, self._free[ref.group])
+            held = self._held[ref.group][ref.index[begin:end], None]
+            np.copyto(record[:, :, column : column + held.shape[2]], 0.0, where=held)
         for add, kept_class, arguments in self._sums[share][f]:
             if kept_class is None:
                 add(record, begin, *arguments)

@@ -27,34 +27,6 @@ def _counting_argsort(keys, num_keys, order, result):
         start[k] += 1
 
 
-@loop
-def _first_and_last(groups, values, first, last):
-    for i in range(groups.shape[0]):
-        g, v = groups[i], values[i]
-        if v < first[g]:
-            first[g] = v
-        if v > last[g]:
-            last[g] = v
-
-
-@loop
-def _merge_runs(groups, values, slot, pointer, value_of_slot):
-    """Number the distinct (group, value) pairs of input sorted by both; return how many there are."""
-    count = 0
-    previous_group, previous_value = -1, -1
-    for i in range(groups.shape[0]):
-        g, v = np.int64(groups[i]), np.int64(values[i])
-        if g != previous_group or v != previous_value:
-            value_of_slot[count] = v
-            pointer[g + 1] += 1
-            count += 1
-            previous_group, previous_value = g, v
-        slot[i] = count - 1
-    for g in range(pointer.shape[0] - 1):
-        pointer[g + 1] += pointer[g]
-    return count
-
-
 @kernel
 def _line_of(keys, row, column, num_columns):
     """Line of the hash table where a pair lies: the one that has its key, or the free one where it belongs.
@@ -67,20 +39,6 @@ def _line_of(keys, row, column, num_columns):
     while keys[h] >= 0 and keys[h] != key:
         h = (h + 1) & mask
     return h
-
-
-@loop
-def _insert(first, second, num_columns, keys, lines):
-    """Put pairs that are not in the table yet into it, with their position as their number; return lines taken."""
-    taken = 0
-    for i in range(first.shape[0]):
-        row, column = np.int64(first[i]), np.int64(second[i])
-        h = _line_of(keys, row, column, num_columns)
-        if keys[h] < 0:
-            keys[h] = row * ((num_columns >> 3) + 1) + (column >> 3)
-            taken += 1
-        lines[h, column & 7] = i
-    return taken
 
 
 @loop
@@ -130,7 +88,7 @@ def argsort_by(keys: tuple[tuple[IntArray, int], ...], count: int) -> IntArray:
     order = np.empty(0, np.int32)
     for key, num_keys in reversed(keys):
         result = np.empty(count, np.int32)
-        _counting_argsort(key, num_keys, order, result)
+        _counting_argsort(np.ascontiguousarray(key, np.int32), num_keys, order, result)
         order = result
     return order
 
@@ -139,17 +97,19 @@ def first_and_last(groups: IntArray, values: IntArray, num_groups: int, num_valu
     """Return the smallest and the largest value of each group; groups without values get ``num_values - 1`` and 0."""
     first = np.full(num_groups, max(num_values - 1, 0), np.int32)
     last = np.zeros(num_groups, np.int32)
-    _first_and_last(groups, values, first, last)
+    np.minimum.at(first, groups, values)
+    np.maximum.at(last, groups, values)
     return first, last
 
 
 def distinct_pairs(groups: IntArray, values: IntArray, num_groups: int) -> tuple[IntArray, IntArray, IntArray]:
     """Number the distinct pairs of sorted input: slot of each entry, row pointer by group, value of each slot."""
-    slot = np.empty(len(groups), np.int32)
-    pointer = np.zeros(num_groups + 1, np.int64)
-    value_of_slot = np.empty(len(groups), np.int32)
-    count = _merge_runs(groups, values, slot, pointer, value_of_slot)
-    return slot, pointer, value_of_slot[:count].copy()
+    is_new = np.ones(len(groups), bool)
+    is_new[1:] = (groups[1:] != groups[:-1]) | (values[1:] != values[:-1])
+    slot = np.cumsum(is_new, dtype=np.int32)
+    slot -= 1
+    first = np.flatnonzero(is_new)
+    return slot, np.searchsorted(groups[first], np.arange(num_groups + 1)), values[first].astype(np.int32)
 
 
 class PairTable:
@@ -161,17 +121,18 @@ class PairTable:
     def __init__(self, num_rows: int, num_columns: int) -> None:
         self._num_columns = num_columns
         self._first = self._second = np.empty(0, np.int32)
-        self.count = self._taken = 0
+        self.count = 0
         self._make(max(64, 8 * num_rows), max(64, 4 * num_rows))
 
     def _make(self, num_pairs: int, num_lines: int) -> None:
         """Make room for so many pairs, and for so many lines of the hash table; a power of two."""
-        first, second = np.empty(num_pairs, np.int32), np.empty(num_pairs, np.int32)
-        first[: self.count], second[: self.count] = self._first[: self.count], self._second[: self.count]
-        self._first, self._second = first, second
+        known = self.pairs()
+        self._first, self._second = np.empty(num_pairs, np.int32), np.empty(num_pairs, np.int32)
+        self.count = self._taken = 0
         num_lines = 1 << (num_lines - 1).bit_length()
         self._keys, self._lines = np.full(num_lines, -1, np.int64), np.full((num_lines, 8), -1, np.int32)
-        self._taken = _insert(first[: self.count], second[: self.count], self._num_columns, self._keys, self._lines)
+        if len(known[0]):
+            self.add_list(*known)
 
     def add_list(self, rows: IntArray, columns: IntArray) -> IntArray:
         """Return the slot of each listed pair."""

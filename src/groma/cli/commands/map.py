@@ -13,6 +13,7 @@ from groma.cli.shared import measurements as _measured
 from groma.cli.shared import options as _options
 from groma.cli.shared.console import Console
 from groma.cli.shared.ranks import led_by_first_rank
+from groma.compilation.ahead import mapping
 from groma.errors import InputError
 
 if TYPE_CHECKING:
@@ -178,7 +179,7 @@ def map_(
         ("--keep-suspects", measured.keep_suspects and not measured, "on measurements (--positions, --control, ...)"),
         ("--truth", truth is not None and not contributions, "with --contributions, which compares with it"),
     )
-    console.begin_compilation("map")
+    console.begin_compilation(mapping(refine_poses))
     from groma.cli.shared.diagnosis import try_diagnosis
     from groma.cli.shared.extending import end_queries, extend_map
     from groma.cli.shared.mapping import run_map, say_map, stages_of_map, write_map

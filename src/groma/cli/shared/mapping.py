@@ -38,6 +38,7 @@ def run_map(
     depth: DepthMaps | None = None,
 ) -> MapResult:
     """Map a folder of photographs; Ctrl-C ends the command and keeps the finished stages in ``work``."""
+    from groma.compilation.ahead import mapping
     from groma.compilation.loading import loading
     from groma.execution import share_memory
     from groma.features.images import one_opencv_thread
@@ -47,14 +48,15 @@ def run_map(
     check_free(work)
     share_memory()
     one_opencv_thread()
-    console.expect_compilation("map")
+    needed = mapping(options.refine_poses)
+    console.expect_compilation(needed)
     start: Start = "photographs" if model is None else "model" if model.num_point_observations else "poses"
     console.expect_stages(
         *stages_of_map(options, start, survey is not None, line_matches is not None, depth is not None)
     )
     if has_stages(work):
         console.say(f"Resuming from the finished stages in {work}, as far as they fit.")
-    with stages_that_are_kept(console, f"finished stages are kept in {work}") as say, loading("map", options.threads):
+    with stages_that_are_kept(console, f"finished stages are kept in {work}") as say, loading(needed, options.threads):
         return map_images(images, work, model, options, say, line_matches, survey, depth)
 
 

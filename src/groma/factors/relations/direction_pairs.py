@@ -88,7 +88,7 @@ def _perpendicular(d1, d2, k1, k2, r, J_first, J_second):
 def _linearize_all(variables, indices, layout, begin, end, columns, record):
     """Write the records of either relation; how many rows they have says which."""
     (sizes, offsets), rows = layout, record.shape[1]
-    r, J_first, J_second = np.empty(rows), np.empty((rows, 3)), np.empty((rows, 3))
+    r, J = np.empty(rows), np.empty((2, rows, 3))
     degenerate = 0
     for i in range(begin, end):
         first = variables[0][indices[0][i], offsets[0] : offsets[0] + 3]
@@ -98,14 +98,14 @@ def _linearize_all(variables, indices, layout, begin, end, columns, record):
         if k1 > 1e-200 and k2 > 1e-200:
             k1, k2 = 1.0 / math.sqrt(k1), 1.0 / math.sqrt(k2)
             if rows == 3:
-                _parallel(first, second, k1, k2, r, J_first, J_second)
+                _parallel(first, second, k1, k2, r, J[0], J[1])
             else:
-                _perpendicular(first, second, k1, k2, r, J_first, J_second)
+                _perpendicular(first, second, k1, k2, r, J[0], J[1])
         else:
-            r[:], J_first[:], J_second[:] = 0.0, 0.0, 0.0
+            r[:], J[:] = 0.0, 0.0
             degenerate += 1
-        put_direction_block(J_first, record[i - begin], columns[0], sizes[0], offsets[0])
-        put_direction_block(J_second, record[i - begin], columns[1], sizes[1], offsets[1])
+        for k in range(2):
+            put_direction_block(J[k], record[i - begin], columns[k], sizes[k], offsets[k])
         put_residual(r, record[i - begin])
     return degenerate
 

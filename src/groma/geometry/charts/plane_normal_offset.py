@@ -20,36 +20,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from groma._numba import loop
 from groma._typing import FloatArray
-from groma.geometry.charts.chart import Chart, perpendicular, perpendicular_kernel, random_planes, reject
-from groma.geometry.charts.unit3 import retract_kernel
+from groma.geometry.charts.chart import Chart, perpendicular, random_planes, reject
+from groma.geometry.charts.unit3 import turned
 
 
-# ------------------------------------------------------------------------------------------------------------ Kernels
-@loop
-def _retract_all(state, delta, out):
-    b = np.empty((2, 3))
-    for i in range(state.shape[0]):
-        retract_kernel(state[i, :3], delta[i, 0], delta[i, 1], b, out[i, :3])
-        out[i, 3] = state[i, 3] + delta[i, 2]
-
-
-@loop
-def _basis_all(state, out):
-    b = np.empty((2, 3))
-    for i in range(state.shape[0]):
-        perpendicular_kernel(state[i, 0], state[i, 1], state[i, 2], b)
-        for j in range(3):
-            out[i, j, 0] = b[0, j]
-            out[i, j, 1] = b[1, j]
-            out[i, j, 2] = 0.0
-        out[i, 3, 0] = 0.0
-        out[i, 3, 1] = 0.0
-        out[i, 3, 2] = 1.0
-
-
-# ------------------------------------------------------------------------------------------------------------- Public
 class NormalOffsetPlane(Chart):
     """Planes by unit normal and offset, ``"normal_offset"``; regular for every finite plane."""
 
@@ -59,7 +34,8 @@ class NormalOffsetPlane(Chart):
 
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
         """Turn the normals by delta1, delta2 and add delta3 to the offsets."""
-        return self._retracted(_retract_all, state, delta)
+        state, delta = self._checked_step(state, delta)
+        return np.column_stack([turned(state[:, :3], delta[:, :2]), state[:, 3] + delta[:, 2]])
 
     def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
         """Increments (N, 3) that lead to the planes ``other``.
@@ -98,7 +74,11 @@ class NormalOffsetPlane(Chart):
 
     def basis(self, state: FloatArray) -> FloatArray:
         """Derivative of (n, w) with respect to the increment, (N, 4, 3)."""
-        return self._basis_by(_basis_all, state)
+        state = self._checked_state(state)
+        out = np.zeros((len(state), 4, 3))
+        out[:, :3, 0], out[:, :3, 1] = perpendicular(state[:, :3])
+        out[:, 3, 2] = 1.0
+        return out
 
     def random(self, rng: np.random.Generator, count: int) -> FloatArray:
         """Planes 0.5 to 2 units from the origin."""

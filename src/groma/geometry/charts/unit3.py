@@ -12,49 +12,16 @@ Two numbers suffice in a basis (b1, b2) of the tangent plane: :math:`\tau = \del
 
 from __future__ import annotations
 
-import math
 from typing import ClassVar
 
 import numpy as np
 
-from groma._numba import kernel, loop
 from groma._typing import FloatArray
 from groma.errors import InputError
 from groma.geometry.algebra import as_rows, vectors
-from groma.geometry.charts.chart import as_steps, perpendicular, perpendicular_kernel, unit
+from groma.geometry.charts.chart import as_steps, perpendicular, unit
 from groma.geometry.charts.registry import charts_of, register_chart
 from groma.geometry.manifold import Manifold
-
-# ---------------------------------------------------------------------------------------------------------- Kernels
-
-
-@kernel
-def retract_kernel(u, first, second, b, out):
-    """Write Exp_u(first b1 + second b2), of unit length, to out (3,); ``b`` (2, 3) is scratch."""
-    perpendicular_kernel(u[0], u[1], u[2], b)
-    t2 = first * first + second * second
-    if t2 < 1e-8:
-        s, c = 1.0 - t2 / 6.0, 1.0 - t2 / 2.0
-    else:
-        t = math.sqrt(t2)
-        s, c = math.sin(t) / t, math.cos(t)
-    norm = 0.0
-    for j in range(3):
-        out[j] = c * u[j] + s * (first * b[0, j] + second * b[1, j])
-        norm += out[j] * out[j]
-    norm = 1.0 / math.sqrt(norm)
-    for j in range(3):
-        out[j] *= norm
-
-
-@loop
-def _retract_all(state, delta, out):
-    b = np.empty((2, 3))
-    for i in range(state.shape[0]):
-        retract_kernel(state[i], delta[i, 0], delta[i, 1], b, out[i])
-
-
-# ----------------------------------------------------------------------------------------------------------- Public
 
 
 def tangent_basis(direction: FloatArray) -> FloatArray:
@@ -85,6 +52,12 @@ def log(direction: FloatArray, other: FloatArray) -> FloatArray:
     return angle * along / length
 
 
+def turned(direction: FloatArray, delta: FloatArray) -> FloatArray:
+    """Unit vectors (N, 3) reached by angles (N, 2), radians, along the tangent basis."""
+    first, second = perpendicular(direction)
+    return unit(exp(direction, delta[:, :1] * first + delta[:, 1:] * second))
+
+
 @register_chart
 class Unit3(Manifold):
     """The chart of directions: two numbers in the tangent basis. The sign of a direction is kept."""
@@ -95,10 +68,7 @@ class Unit3(Manifold):
 
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
         """Move unit vectors (N, 3) by angles (N, 2), radians, along the tangent basis."""
-        state, delta = as_steps(state, delta, 3, 2)
-        out = np.empty_like(state)
-        _retract_all(state, delta, out)
-        return out
+        return turned(*as_steps(state, delta, 3, 2))
 
     def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
         """Angles (N, 2) that lead from ``state`` to ``other``."""

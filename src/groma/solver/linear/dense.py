@@ -8,7 +8,6 @@ from functools import cached_property
 
 import numpy as np
 
-from groma._numba import loop
 from groma._typing import FloatArray
 from groma.problem.layout import Layout
 from groma.solver.linear.blocks import Blocks, split
@@ -20,22 +19,6 @@ DENSE_FLOPS_PER_SECOND = 2.5e10
 #: Up to this many unknowns a dense factorisation costs little, and is exact: where poses alone are kept, and otherwise
 #: (cost: time alone).
 DENSE_POSE_UNKNOWNS, DENSE_OTHER_UNKNOWNS = 360, 1000
-
-# ---------------------------------------------------------------------------------------------------------- Kernels
-
-
-@loop
-def _scatter(blocks, rows, columns, row_start, column_start, M):
-    """Write the blocks into the upper triangle of M."""
-    n, a, b = blocks.shape
-    for i in range(n):
-        r, c = row_start + np.int64(rows[i]) * a, column_start + np.int64(columns[i]) * b
-        for k in range(a):
-            for m in range(b):
-                M[r + k, c + m] = blocks[i, k, m]
-
-
-# ----------------------------------------------------------------------------------------------------------- Public
 
 
 @register_linear_solver("dense")
@@ -76,5 +59,7 @@ class Dense:
         """Write the blocks into the upper triangle of M (unknowns, unknowns)."""
         layout = self._layout
         for (a, b), S in blocks.items():
+            first, second = layout.kept[a], layout.kept[b]
+            part = M[first.start :, second.start :][: first.count * first.width, : second.count * second.width]
             rows, columns = layout.blocks[a, b]
-            _scatter(S, rows, columns, layout.kept[a].start, layout.kept[b].start, M)
+            part.reshape(first.count, first.width, second.count, second.width)[rows, :, columns] = S

@@ -191,4 +191,5 @@ class Leaves:
 
     def solve(self, x: FloatArray, back: bool = False) -> None:
         """Substitute forward in all leaves, or back."""
-        solve_leaves(self.numbers, self.size, self.first, self.at, self.unknowns, self.L, x, back)
+        if len(self):
+            solve_leaves(self.numbers, self.size, self.first, self.at, self.unknowns, self.L, x, back)

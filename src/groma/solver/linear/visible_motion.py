@@ -11,13 +11,12 @@ the chart. A standard deviation of 1 means that the distance could as well be tw
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from groma._numba import loop
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.geometry.algebra import norm
 from groma.geometry.manifold import Manifold
 from groma.problem.problem import Problem
 
@@ -25,27 +24,6 @@ from groma.problem.problem import Problem
 SEEN = ("point", "line", "plane", "direction")
 
 
-# ------------------------------------------------------------------------------------------------------------ Kernels
-@loop
-def _add_centers(variable, pose, centers, count, middle):
-    """Count the observations of each variable and sum the centres they are made from."""
-    for i in range(variable.shape[0]):
-        v, p = variable[i], pose[i]
-        count[v] += 1
-        for k in range(3):
-            middle[v, k] += centers[p, k]
-
-
-@loop
-def _add_distances(variable, pose, centers, at, distance):
-    """Sum the distances of each variable from the centres that see it."""
-    for i in range(variable.shape[0]):
-        v, p = variable[i], pose[i]
-        x, y, z = at[v, 0] - centers[p, 0], at[v, 1] - centers[p, 1], at[v, 2] - centers[p, 2]
-        distance[v] += math.sqrt(x * x + y * y + z * z)
-
-
-# ------------------------------------------------------------------------------------------------------------- Public
 @dataclass(frozen=True)
 class Observers:
     """Which poses see the variables of a group: one pair for each observation, in no particular order."""
@@ -97,12 +75,11 @@ def observers(problem: Problem, name: str, centers: dict[str, FloatArray]) -> Ob
             variables.append(mine[0].index.astype(np.int64))
             poses.append(from_pose[0].index.astype(np.int64) + offsets[from_pose[0].group])
     variable, pose = np.concatenate(variables), np.concatenate(poses)
-    count, middle, distance = np.zeros(number, np.int64), np.zeros((number, 3)), np.zeros(number)
-    _add_centers(variable, pose, all_centers, count, middle)
+    group, count, seen_from = problem.variables[name], np.bincount(variable, minlength=number), all_centers[pose]
+    middle = np.column_stack([np.bincount(variable, column, number) for column in seen_from.T])
     middle /= np.maximum(count, 1)[:, None]
-    group = problem.variables[name]
-    _add_distances(variable, pose, all_centers, nearest_place(group.manifold, group.state, middle), distance)
-    distance /= np.maximum(count, 1)
+    away = nearest_place(group.manifold, group.state, middle)[variable] - seen_from
+    distance = np.bincount(variable, norm(away), number) / np.maximum(count, 1)
     fallback = float(np.median(distance[count > 0])) if (count > 0).any() else 1.0
     distance = np.where(distance > 0, distance, max(fallback, 1e-300))
     return Observers(variable, pose, all_centers, count, distance, middle)

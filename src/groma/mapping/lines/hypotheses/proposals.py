@@ -34,6 +34,7 @@ from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.gates import LINE_MAPS, gate
 from groma.geometry.algebra import perpendicular
+from groma.mapping.lines.bins import in_bins
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.hypotheses.known_points import lines_through_points
 from groma.mapping.lines.options import MapLinesOptions
@@ -237,24 +238,6 @@ def _propose_pairs(
     return count
 
 
-@loop
-def _bin_beams(beams, pointers, members):
-    """Members of every bin of the angle about the baseline; members is None-sized on the first call (counts only)."""
-    num_bins = len(pointers) - 1
-    size = 2.0 * math.pi / num_bins
-    fill = np.zeros(num_bins, np.int64)
-    for j in range(len(beams)):
-        low, high = int(np.floor(beams[j, 0] / size)), int(np.floor(beams[j, 1] / size))
-        for k in range(low, min(high, low + num_bins - 1) + 1):
-            b = k % num_bins
-            if len(members):
-                members[pointers[b] + fill[b]] = j
-            fill[b] += 1
-    if not len(members):
-        for b in range(num_bins):
-            pointers[b + 1] = pointers[b] + fill[b]
-
-
 # ------------------------------------------------------------------------------------------------------------- Public
 def angles_about_baseline(ray: FloatArray, baseline: FloatArray) -> FloatArray:
     """Intervals (n, 3) of the angles about a baseline that segments with rays (n, 2, 3) cover, low first.
@@ -368,11 +351,7 @@ def _sorted_beams(beam_i: FloatArray, beam_j: FloatArray) -> tuple[FloatArray | 
     Returns the intervals, pointers and members of the bins that each covers, their order by where they begin, and
     which of that order (n, 2), counted on around the circle, begin within each interval of image i.
     """
-    pointers = np.zeros(_NUM_BINS + 1, np.int64)
-    _bin_beams(beam_j, pointers, np.empty(0, np.int64))
-    members = np.empty(pointers[-1], np.int64)
-    if len(members):
-        _bin_beams(beam_j, pointers, members)
+    members, pointers = in_bins(beam_j, 2.0 * math.pi / _NUM_BINS, _NUM_BINS)
     order = np.argsort(beam_j[:, 0], kind="stable")
     first = beam_j[order, 0]
     return (

@@ -47,34 +47,39 @@ def _largest_deviation(H, g, L, x):
 @loop
 def _examine(camera, image, own, pointers, active, X, U, squared, uncertainty, unchecked):
     """Write what :class:`Fit` tells of lines that were refined."""
-    r, J, g, x = np.zeros(2), np.zeros((2, 4)), np.zeros(4), np.zeros(4)
+    r, g, x = np.zeros(2), np.zeros(4), np.zeros(4)
     L, H, without = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((4, 4))
     for n in range(len(pointers) - 1):
         begin, end = pointers[n], pointers[n + 1]
+        J = np.empty((end - begin, 2, 4))
         H[:, :] = 0.0
         for m in range(begin, end):
-            line_residuals(camera, image[m], own, m, X[n], U[n], r, J)
+            own_J = J[m - begin]
+            line_residuals(camera, image[m], own, m, X[n], U[n], r, own_J)
             squared[m] = r[0] * r[0] + r[1] * r[1]
             if active[m]:
                 for a in range(4):
                     for b in range(a + 1):
-                        H[a, b] += J[0, a] * J[0, b] + J[1, a] * J[1, b]
-        uncertainty[n] = _largest_deviation(H, g, L, x)
-        for m in range(begin, end):
-            if not active[m] or (m > begin and active[m - 1] and image[m] == image[m - 1]):
+                        H[a, b] += own_J[0, a] * own_J[0, b] + own_J[1, a] * own_J[1, b]
+        for m in range(begin - 1, end):  # with all images, then without that of each observation
+            if m >= begin and (not active[m] or (m > begin and active[m - 1] and image[m] == image[m - 1])):
                 continue
             for a in range(4):
-                for b in range(4):
+                for b in range(a + 1):
                     without[a, b] = H[a, b]
-            for k in range(m, end):
-                if image[k] != image[m]:
-                    break
+            k = max(m, begin)
+            while m >= begin and k < end and image[k] == image[m]:
                 if active[k]:
-                    line_residuals(camera, image[k], own, k, X[n], U[n], r, J)
+                    own_J = J[k - begin]
                     for a in range(4):
                         for b in range(a + 1):
-                            without[a, b] -= J[0, a] * J[0, b] + J[1, a] * J[1, b]
-            unchecked[n] = max(unchecked[n], _largest_deviation(without, g, L, x))
+                            without[a, b] -= own_J[0, a] * own_J[0, b] + own_J[1, a] * own_J[1, b]
+                k += 1
+            worst = _largest_deviation(without, g, L, x)
+            if m < begin:
+                uncertainty[n] = worst
+            else:
+                unchecked[n] = max(unchecked[n], worst)
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from groma.mapping.groups import distinct_pairs
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.hypotheses.places import Places
 from groma.mapping.lines.linking.fit import find_on_lines, near_together
-from groma.mapping.lines.linking.link import join_once, link
+from groma.mapping.lines.linking.link import link
 from groma.mapping.lines.linking.tracks import Tracks
 from groma.mapping.lines.options import MapLinesOptions
 
@@ -151,14 +151,19 @@ def _on_lines_in(
 def _same_lines(tracks: Tracks, hit: IntArray) -> IntArray:
     """(L,) the line that each line becomes: line B becomes A where A explains B's segments in most of B's images.
 
-    Pairs with most votes come first.
+    Pairs with most votes come first. A line is joined once, and only to one that is not joined itself: chains are left
+    to the next round.
     """
     owner, alias = tracks.line_of[hit[:, 1]], np.arange(tracks.num_lines)
     pairs, votes = votes_for_same(tracks, hit, (owner >= 0) & (owner != hit[:, 0]))
     enough = AGREEMENT.min_common * tracks.num_images()[pairs[:, 1]]
     good = (votes >= tracks.gates.min_common_images) & (votes >= enough)
     pairs, votes = pairs[good], votes[good]
-    join_once(pairs[np.argsort(-votes, kind="stable")], alias, np.zeros(tracks.num_lines, np.bool_))
+    taken = set()
+    for a, b in pairs[np.argsort(-votes, kind="stable")].tolist():
+        if alias[a] == a and alias[b] == b and b not in taken:
+            alias[b] = a
+            taken.add(a)
     return alias
 
 

@@ -54,16 +54,14 @@ def _explains(P, center, ray, q, variance1, variance2, sigma_a, line, ends, sigm
 @kernel
 def _agree(s, r, camera, center, image, ray, q, covariance, sigma, line, ends, gate):
     """Whether the places of two segments explain each other."""
-    i, j = image[s], image[r]
-    if not _explains(
-        camera[j], center[i], ray[s], q[s], covariance[s, 0], covariance[s, 2], sigma[s], line[r], ends[r], sigma[r],
-        gate,
-    ):  # fmt: skip
-        return False
-    return _explains(
-        camera[i], center[j], ray[r], q[r], covariance[r, 0], covariance[r, 2], sigma[r], line[s], ends[s], sigma[s],
-        gate,
-    )  # fmt: skip
+    for _ in range(2):
+        if not _explains(
+            camera[image[r]], center[image[s]], ray[s], q[s], covariance[s, 0], covariance[s, 2], sigma[s], line[r],
+            ends[r], sigma[r], gate,
+        ):  # fmt: skip
+            return False
+        s, r = r, s
+    return True
 
 
 @kernel
@@ -75,40 +73,24 @@ def _root(parent, s):
 
 
 @loop
-def _mutual(edges, camera, center, image, ray, q, covariance, sigma, line, ends, gate, keep):
-    for e in range(len(edges)):
-        keep[e] = _agree(
-            edges[e, 0], edges[e, 1], camera, center, image, ray, q, covariance, sigma, line, ends, gate
-        )  # fmt: skip
+def _join(edges, camera, center, image, ray, q, covariance, sigma, line, ends, gate, agree, rank, parent):
+    """Whether the places at both ends of each edge explain each other.
 
-
-@loop
-def _join(edges, rank, camera, center, image, ray, q, covariance, sigma, line, ends, gate, parent):
-    """Union of segments along edges, best first; a group stands for itself by its member of highest rank."""
+    With ``parent``, those of the groups that both ends are in, which are then joined, best edges first; a group stands
+    for itself by its member of highest rank.
+    """
     for e in range(len(edges)):
-        s, r = _root(parent, edges[e, 0]), _root(parent, edges[e, 1])
-        if s == r:
-            continue
-        if not _agree(s, r, camera, center, image, ray, q, covariance, sigma, line, ends, gate):
-            continue
-        if rank[s] >= rank[r]:
-            parent[r] = s
-        else:
-            parent[s] = r
+        s, r = edges[e, 0], edges[e, 1]
+        if len(parent):
+            s, r = _root(parent, s), _root(parent, r)
+        agree[e] = s != r and _agree(s, r, camera, center, image, ray, q, covariance, sigma, line, ends, gate)
+        if len(parent) and agree[e]:
+            if rank[s] >= rank[r]:
+                parent[r] = s
+            else:
+                parent[s] = r
     for s in range(len(parent)):
         parent[s] = _root(parent, s)
-
-
-@loop
-def join_once(pairs, alias, taken):
-    """Join the second line of each pair to the first, best pairs first, by writing ``alias``.
-
-    A line is joined once, and only to one that is not joined itself: chains are left to the next round.
-    """
-    for e in range(len(pairs)):
-        a, b = pairs[e, 0], pairs[e, 1]
-        if alias[a] == a and alias[b] == b and not taken[b]:
-            alias[b], taken[a] = a, True
 
 
 # ------------------------------------------------------------------------------------------------------------- Public
@@ -140,17 +122,16 @@ def link(
         views.camera, views.center, views.image_idx, views.ray, places.q, places.covariance, sigma, views.line,
         views.ends,
     )  # fmt: skip
-    keep = np.zeros(len(edges), bool)
+    agree, rank = np.zeros(len(edges), bool), places.score * np.sqrt(views.length)
 
     def compare(part: slice) -> None:
-        _mutual(edges[part], *tables, max_squared, keep[part])
+        _join(edges[part], *tables, max_squared, agree[part], rank, np.empty(0, np.int64))
 
     map_ranges(compare, len(edges), _EDGES_AT_ONCE)
-    edges = edges[keep]
-    rank = places.score * np.sqrt(views.length)
+    edges = edges[agree]
     edges = edges[np.argsort(-rank[edges].min(1), kind="stable")]
     parent = np.arange(len(free))
-    _join(edges, rank, *tables, max_squared, parent)
+    _join(edges, *tables, max_squared, np.empty(len(edges), bool), rank, parent)
     size = np.bincount(parent, minlength=len(parent))
     members = np.flatnonzero(size[parent] > 1)
     return members, parent[members]

@@ -22,13 +22,16 @@ from functools import partial
 
 import numpy as np
 
-from groma._numba import kernel, loop
+from groma._numba import loop
+from groma._rows import numbered
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.estimators.batch_least_squares import PROBLEMS_AT_ONCE
-from groma.estimators.two_point_line import across_basis, line_residuals
-from groma.execution import begin, map_ranges
+from groma.estimators.batch_least_squares import Observations, solve_batch
+from groma.estimators.two_point_line import TWO_POINT_LINE
+from groma.execution import begin
 from groma.features.segments import SEGMENTS
 from groma.gates import gate
+from groma.geometry.algebra import apply, dot
+from groma.mapping.lines.bins import in_bins
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.linking.tracks import Tracks
 from groma.mapping.lines.outcomes import Outcome
@@ -51,33 +54,6 @@ _MEDIAN_SQUARE = 0.6
 
 
 # -------------------------------------------------------------------------------------------------------------- Loops
-@loop
-def _information(camera, image, own, pointers, X, H, U):
-    """Information (L, 4, 4) of the offsets of both points of each line, in the basis (L, 2, 3) across it."""
-    r, J = np.zeros(2), np.zeros((2, 4))
-    for n in range(len(pointers) - 1):
-        across_basis(X[n], U[n])
-        for m in range(pointers[n], pointers[n + 1]):
-            line_residuals(camera, image[m], own, m, X[n], U[n], r, J)
-            for a in range(4):
-                for b in range(4):
-                    H[n, a, b] += J[0, a] * J[0, b] + J[1, a] * J[1, b]
-
-
-@loop
-def _bin_lines(order, first_bin, last_bin, pointers, members):
-    """Lines of every bin, in the given order; ``members`` empty: only their numbers, in ``pointers``."""
-    fill = np.zeros(len(pointers) - 1, np.int64)
-    for n in order:
-        for k in range(first_bin[n], last_bin[n] + 1):
-            if len(members):
-                members[pointers[k] + fill[k]] = n
-            fill[k] += 1
-    if not len(members):
-        for k in range(len(fill)):
-            pointers[k + 1] = pointers[k] + fill[k]
-
-
 @loop
 def _near_pairs(pointers, members, first_bin, low, X, reach, max_angle, min_overlap, pairs, span):
     """Pairs of lines that are nearly parallel, overlap, and are near there; return the number written, or needed.
@@ -122,36 +98,6 @@ def _near_pairs(pointers, members, first_bin, low, X, reach, max_angle, min_over
                     span[count, 0], span[count, 1] = first, last
                 count += 1
     return count
-
-
-@kernel
-def _side_by_side(ends, line, other, min_overlap, same_edge):
-    """Whether two segments of an image overlap along the first one and are apart across it."""
-    ux, uy = ends[2] - ends[0], ends[3] - ends[1]
-    length2 = ux * ux + uy * uy
-    t0 = ((other[0] - ends[0]) * ux + (other[1] - ends[1]) * uy) / length2
-    t1 = ((other[2] - ends[0]) * ux + (other[3] - ends[1]) * uy) / length2
-    low, high = min(t0, t1), max(t0, t1)
-    away0 = abs(line[0] * other[0] + line[1] * other[1] + line[2])
-    away1 = abs(line[0] * other[2] + line[1] * other[3] + line[2])
-    return min(high, 1.0) - max(low, 0.0) > min_overlap * min(1.0, high - low) and max(away0, away1) > same_edge
-
-
-@loop
-def _apart(pairs, pointers, rows, image, ends, line, min_overlap, same_edge, apart):
-    """Whether some image shows both lines of a pair side by side; the observations of a line come by image."""
-    for n in range(len(pairs)):
-        a, b = pairs[n, 0], pairs[n, 1]
-        i, begin = pointers[a], pointers[b]
-        while i < pointers[a + 1] and not apart[n]:
-            s = rows[i]
-            while begin < pointers[b + 1] and image[rows[begin]] < image[s]:
-                begin += 1
-            j = begin
-            while j < pointers[b + 1] and image[rows[j]] == image[s] and not apart[n]:
-                apart[n] = _side_by_side(ends[s], line[s], ends[rows[j]], min_overlap, same_edge)
-                j += 1
-            i += 1
 
 
 # ------------------------------------------------------------------------------------------------------------- Public
@@ -201,17 +147,13 @@ class _Pairs:
 
 def _compare(tracks: Tracks) -> _Pairs:
     """Pairs of lines that are near each other."""
-    views, count, X = tracks.views, tracks.num_lines, tracks.lines
+    views, X = tracks.views, tracks.lines
     unit = begin(partial(_pixel_size, tracks))
     rows, pointers = tracks.table()
-    H, U = np.zeros((count, 4, 4)), np.zeros((count, 2, 3))
     own = np.column_stack([views.ends[rows], tracks.sigma[rows]])
-    image = views.image_idx[rows]
-
-    def inform(part: slice) -> None:
-        _information(views.camera, image, own, pointers[part.start : part.stop + 1], X[part], H[part], U[part])
-
-    map_ranges(inform, count, PROBLEMS_AT_ONCE)
+    observations = Observations(views.camera, views.image_idx[rows], own, pointers, np.ones(len(rows), bool))
+    known = solve_batch(TWO_POINT_LINE, observations, X, max_steps=0)  # information and bases of the lines as they are
+    H, U = known.information, known.frames
     noise = begin(lambda: np.linalg.inv(H + 1e-9 * np.einsum("nii->n", H)[:, None, None] * np.eye(4)))
     pairs, span = _candidates(X, MERGE.max_distance * unit())
     (a, b), covariance = pairs.T, noise()
@@ -244,12 +186,10 @@ def _candidates(X: FloatArray, reach: FloatArray) -> tuple[IntArray, FloatArray]
     start, extent = bounds[:, 0].min(), bounds[:, 1] - bounds[:, 0]
     # (cost: time; pairs are put in the order of one sweep)
     width = max(4.0 * float(np.median(extent)), float(extent.sum()) / (4.0 * len(X)), np.ptp(bounds) / (4.0 * len(X)))
-    bins = np.floor((bounds - start) / max(width, 1e-300)).astype(np.int64)
-    first_bin, last_bin = np.ascontiguousarray(bins.T)
-    pointers = np.zeros(int(last_bin.max()) + 2, np.int64)
-    _bin_lines(order, first_bin, last_bin, pointers, np.empty(0, np.int64))
-    members = np.empty(pointers[-1], np.int64)
-    _bin_lines(order, first_bin, last_bin, pointers, members)
+    extents = (bounds - start) / max(width, 1e-300)
+    first_bin = np.floor(extents[:, 0]).astype(np.int64)
+    members, pointers = in_bins(extents[order], 1.0, int(extents.max()) + 1)
+    members = order[members]
     pairs, span = np.empty((4096, 2), np.int64), np.empty((4096, 2))
     while True:
         needed = _near_pairs(
@@ -281,12 +221,22 @@ def _pixel_size(tracks: Tracks) -> FloatArray:
 
 def seen_apart(tracks: Tracks, pairs: IntArray) -> BoolArray:
     """Whether an image shows both lines of a pair as segments side by side."""
-    views = tracks.views
-    rows, pointers = tracks.table()
-    apart = np.zeros(len(pairs), np.bool_)
-    limits = SEGMENTS.overlap, SEGMENTS.edge
-    _apart(pairs, pointers, rows, views.image_idx, views.ends, views.line, *limits, apart)
-    return apart
+    views, (rows, pointers) = tracks.views, tracks.table()
+    count, image = np.diff(pointers), views.image_idx[rows]
+    pair, number = numbered(count[pairs[:, 0]])
+    at = pointers[pairs[pair, 0]] + number  # segments of the first line, and those of the second in the same image
+    size = np.int64(image.max(initial=0)) + 1
+    keys, wanted = np.repeat(np.arange(len(count)), count) * size + image, pairs[pair, 1] * size + image[at]
+    begin = np.searchsorted(keys, wanted)
+    one, number = numbered(np.searchsorted(keys, wanted, "right") - begin)
+    first, second = rows[at[one]], rows[begin[one] + number]
+    start, other = views.ends[first, None, :2], views.ends[second].reshape(-1, 2, 2)
+    along, line = views.ends[first, 2:] - start[:, 0], views.line[first]
+    place = np.sort(apply(other - start, along) / dot(along, along)[:, None], axis=1)
+    away = np.abs(apply(other, line[:, :2]) + line[:, 2:]).max(axis=1)
+    overlap = np.minimum(place[:, 1], 1.0) - np.maximum(place[:, 0], 0.0)
+    side_by_side = (overlap > SEGMENTS.overlap * np.minimum(place[:, 1] - place[:, 0], 1.0)) & (away > SEGMENTS.edge)
+    return np.bincount(pair[one[side_by_side]], minlength=len(pairs)) > 0
 
 
 def _preferred(pairs: IntArray, distance: FloatArray, count: int) -> BoolArray:
