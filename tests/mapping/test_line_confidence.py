@@ -21,7 +21,17 @@ from groma.mapping.lines.confidence import (
 )
 from groma.mapping.noise.landmarks import line_noise
 from groma.mapping.options import MapOptions
-from groma.scene import Cameras, LineObservations, Lines, Planes, Relations, Scene, Similarity
+from groma.scene import (
+    Cameras,
+    LineObservations,
+    Lines,
+    Planes,
+    PointObservations,
+    Points,
+    Relations,
+    Scene,
+    Similarity,
+)
 
 FOCAL = 500.0
 
@@ -74,6 +84,63 @@ def test_evidence_by_hand():
     np.testing.assert_allclose(np.exp(support), [2.5 / 1.5, 5.0])
 
 
+def with_points(scene, xyz, image_idx, point_idx):
+    pixel = np.zeros((len(image_idx), 2))
+    return scene.replace(
+        points=Points.at(np.asarray(xyz, float)),
+        point_observations=PointObservations.numbered(image_idx, point_idx, pixel),
+    )
+
+
+def test_images_of_what_is_beside_a_line_must_show_it():
+    # Two lines, one of which three images of six do not show; a point beside either.
+    whole = scene_of([[[-1.0, -1, 10], [-1, 1, 10]], [[1.0, -1, 10], [1, 1, 10]]], np.eye(3)[np.zeros(6, int)], 0.0)
+    seen, xyz = whole.line_observations, [[-1.1, 0, 10], [1.1, 0, 10]]
+    scene = whole.keep(line_observations=(seen.line_idx == 1) | (seen.image_idx < 3))
+
+    def beside(scene):
+        return np.exp(columns(scene)["beside"])
+
+    image, point = (index.ravel() for index in np.meshgrid(np.arange(6), [0, 1], indexing="ij"))
+    every = [3.5 / 3.5, 6.5 / 0.5]
+    np.testing.assert_allclose(beside(with_points(scene, xyz, image, point)), every)
+    # What hides the line hides the point.
+    rows = (point == 1) | (image < 3)
+    np.testing.assert_allclose(beside(with_points(scene, xyz, image[rows], point[rows])), [3.5 / 0.5, 6.5 / 0.5])
+    # Six of nine images of lines show the points beside them: one that does, but not the line, stands for 1.5.
+    rows = np.isin(6 * point + image, [0, 3, 6, 7, 8, 9, 10])
+    found = beside(with_points(scene, xyz, image[rows], point[rows]))
+    np.testing.assert_allclose(found, [3.5 / (1.5 + 0.5), 6.5 / 0.5])
+    # Without points, and with points that no image shows, every image counts in whose frame it lies.
+    np.testing.assert_allclose(beside(scene), np.exp(columns(scene)["support"]))
+    np.testing.assert_allclose(beside(with_points(scene, xyz, [], [])), every)
+
+
+def test_outlines_of_cylinders_drift_and_edges_do_not():
+    # Upright edges seen from 90 degrees around; of the last ten, the outlines of cylinders around them are seen.
+    rng, radius = np.random.default_rng(5), np.repeat([0.0, 0.2], [60, 10])
+    angle = np.radians(np.linspace(-45.0, 45.0, 9))
+    x, z = rng.uniform(-1, 1, (2, 70))
+    up = np.stack([np.column_stack([x, y * np.ones(70), z]) for y in (-1.0, 1.0)], axis=1)
+    right, away = np.cos(angle)[:, None] * x + np.sin(angle)[:, None] * z, 10.0 - np.sin(angle)[:, None] * x
+    away = away + np.cos(angle)[:, None] * z
+    distance = np.hypot(right, away)
+    column = 500.0 + FOCAL * np.tan(np.arctan2(right, away) + np.arcsin(radius / distance))
+    rows = 500.0 + FOCAL * np.array([-1.0, 1.0])[:, None, None] / away
+    pixels = np.stack([column, rows[0], column, rows[1]], axis=-1).reshape(-1, 4)
+    image, line = (index.ravel() for index in np.meshgrid(np.arange(9), np.arange(70), indexing="ij"))
+    half, poses = 0.5 * angle, np.zeros((9, 7))
+    poses[:, 1], poses[:, 3], poses[:, 6] = np.sin(half), np.cos(half), 10.0
+    scene = scene_of(up, np.zeros((9, 3))).with_poses(poses)
+    seen = LineObservations(image, line, pixels + rng.normal(0, 0.5, pixels.shape))
+    deviations = np.expm1(columns(scene.replace(line_observations=seen))["drift"])
+    assert np.sqrt(np.mean(deviations[:60] ** 2)) == pytest.approx(1.0, abs=0.25)  # three deviations of 60 draws
+    # The radius, 10 px, over what it is known to: it is what mean and cosine of the angles do not tell alike.
+    cosine = np.cos(angle)
+    sigma = 0.5 / np.sqrt(2.0 * (9.0 - cosine.sum() ** 2 / (cosine**2).sum()))
+    np.testing.assert_allclose(deviations[60:].mean(), 10.0 / sigma, rtol=0.25)
+
+
 def test_lines_that_do_not_stand_out_are_texture(scene):
     seen, stripes = scene.line_observations, np.arange(10)
     told = np.where(np.isin(seen.line_idx, stripes), 1.5, 20.0)
@@ -90,7 +157,8 @@ def test_lines_that_do_not_stand_out_are_texture(scene):
 
 def test_an_edge_and_texture_are_equally_likely_at_the_gate():
     weights = np.array(list(WEIGHTS.values()))
-    rows = np.array([[1.0, 0, 0, 0, 0], [1.0, 0, 0, 0, 20.0], [1.0, 0, 0, 0, -20.0]])
+    rows = np.zeros((3, len(WEIGHTS)))
+    rows[:, 0], rows[:, -1] = 1.0, [0.0, 20.0, -20.0]
     at, far, below = edge_probability(rows, weights)
     assert at == pytest.approx(0.5 * far) and below < 1e-12
 

@@ -53,6 +53,17 @@ def test_an_occluder_does_not_break_a_line_and_the_majority_decides_on_gaps():
     np.testing.assert_allclose(found(*gap[:10], (7, 0, 1), (8, 0, 1)), [[0, 1]])
 
 
+def test_a_line_ends_where_most_images_end_together():
+    together = [(k, 0, 0.5 + 0.001 * k) for k in range(6)]  # within 3 pixels
+    np.testing.assert_allclose(found(*together, (6, 0, 1), (7, 0, 1)), [[0, 0.505]])
+    np.testing.assert_allclose(found(*together, (6, 0, 1), (7, 0, 1), (8, 0, 1), (9, 0, 1)), [[0, 1]])
+    mirrored = [(k, 0.5 - 0.001 * k, 1) for k in range(6)]
+    np.testing.assert_allclose(found(*mirrored, (6, 0, 1), (7, 0, 1)), [[0.495, 1]])
+    # What stands before it hides another part from every view.
+    apart = [(k, 0, 0.3 + 0.1 * k) for k in range(6)]
+    np.testing.assert_allclose(found(*apart, (6, 0, 1), (7, 0, 1)), [[0, 1]])
+
+
 def test_places_seen_for_a_pixel_or_two_are_none():
     chance = [(0, 0, 0.5), (1, 0, 0.5), (2, 0.7, 0.705), (3, 0.69, 0.704), (0, 0.9, 1), (1, 0.9, 1)]
     np.testing.assert_allclose(found(*chance), [[0, 0.5], [0.9, 1]])

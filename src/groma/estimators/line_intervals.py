@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 r"""Which intervals of a line images support, from what each image's segments cover of it. Kernels only.
 
-At a place t of a line let c(t) be the number of images whose segments cover it, and d(t) the number of images that deny
-it: they show the line on both sides of t, but not there. Breaks no wider than the noise of segment ends are no breaks.
-The place is supported where at least two images show it, as many as the ends of a line need, and are not outvoted by
-the rule that decides on the ends (:mod:`groma.estimators.line_ends`):
+At a place t of a line let c(t) be the number of images whose segments cover it, d(t) the number of images that deny
+it: they show the line on both sides of t, but not there, and e(t) the most images that show it on one side only and
+end at the same place. Breaks no wider than the noise of segment ends are no breaks. The place is supported where at
+least two images show it, as many as the ends of a line need, and are not outvoted, neither by the rule that decides on
+the ends (:mod:`groma.estimators.line_ends`) nor by images that end together, as those of a curve beside its chord do:
 
-.. math:: c \ge 2, \qquad d < 3\, c.
+.. math:: c \ge 2, \qquad d < 3\, c, \qquad e < 2\, c.
 
 An interval between two supported ones is supported, too, where it is no wider than the noise of the ends, or where one
 image shows all of it and none denies it. What stands before a line in some images does not break it: it hides another
@@ -14,6 +15,8 @@ part of it from every view. What is gone in all images does.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,10 +26,20 @@ from groma._rows import numbered
 from groma._typing import FloatArray, IntArray
 from groma.estimators.line_ends import LINE_ENDS
 from groma.execution import map_ranges
-from groma.gates import numbers
+from groma.gates import gate
 
 #: Images that must show a place of a line.
 _MIN_IMAGES = 2
+
+
+@dataclass(frozen=True)
+class IntervalGates:
+    """When a place of a line is supported, in addition to what decides on its ends."""
+
+    ended: float = gate(2.0, "ratio", "images that end at one place, over those that go on", "chosen on the chair")
+
+
+GATES = IntervalGates()
 #: Lines that are worth a thread: some milliseconds (cost: time only).
 _LINES_AT_ONCE = 512
 
@@ -77,9 +90,35 @@ def _votes(owner, first, last, place):
 
 
 @kernel
+def _num_ended(owner, first, last, place, noise):
+    """Count the images that show a line on one side of a place only and end at the same place, the most that do."""
+    ends = np.empty(len(owner))
+    found = k = 0
+    while k < len(owner):
+        low, high = first[k], last[k]
+        begin = k
+        while k < len(owner) and owner[k] == owner[begin]:
+            low, high = min(low, first[k]), max(high, last[k])
+            k += 1
+        if high < place:
+            ends[found] = high
+            found += 1
+        elif low > place:
+            ends[found] = low
+            found += 1
+    order = ascending(ends[:found])
+    most = start = 0
+    for k in range(found):
+        while ends[order[k]] - ends[order[start]] > 2.0 * noise:
+            start += 1
+        most = max(most, k - start + 1)
+    return most
+
+
+@kernel
 def _intervals(image, low, high, size, gates, begins, ends):
     """Write the supported intervals of a line between 0 and 1; return their number."""
-    same_end, majority, _ = gates
+    same_end, majority, most_ended = gates
     owner, first, last = _joined(image, low, high, size, same_end)
     noise = same_end * median(size)
     cuts = np.empty(2 * len(first))
@@ -92,7 +131,8 @@ def _intervals(image, low, high, size, gates, begins, ends):
         if not begin < end:
             continue
         shown, denied = _votes(owner, first, last, 0.5 * (begin + end))
-        if shown >= _MIN_IMAGES and denied < majority * shown:
+        ended = _num_ended(owner, first, last, 0.5 * (begin + end), noise)
+        if shown >= _MIN_IMAGES and denied < majority * shown and ended < most_ended * shown:
             if found and (bridged or begin - ends[found - 1] <= noise):
                 ends[found - 1] = end
             else:
@@ -150,7 +190,7 @@ def supported_intervals(
     begins, ends = np.zeros(len(order)), np.zeros(len(order))
     count = np.zeros(num_lines, np.int64)
     columns = [np.ascontiguousarray(column[order], np.float64) for column in (share[:, 0], share[:, 1], size)]
-    image, gates = np.ascontiguousarray(image_idx[order]), numbers(LINE_ENDS)
+    image, gates = np.ascontiguousarray(image_idx[order]), (LINE_ENDS.same_end, LINE_ENDS.majority, GATES.ended)
 
     def fill(part: slice) -> None:
         _all_intervals(pointers[part.start : part.stop + 1], image, *columns, gates, begins, ends, count[part])

@@ -7,16 +7,17 @@ the usual distance of lines from their cameras. Four things must be true of it:
 .. math:: p = \frac{1}{1 + \exp(-w_0 - \sum_k w_k x_k)}\; \frac{1}{1 + \exp(-w_t x_t)}\;
           \operatorname{erf}\frac{\tau}{\sqrt 2\, u}\; \operatorname{erf}\frac{1}{\sqrt 2\, r}.
 
-The first factor, that its segments belong together, is a logistic model of three quantities (:func:`line_evidence`).
-The second, that they are no texture, is one of the prominence alone: contrast
-(:mod:`groma.features.contrast`) times relative length, since texture has stripes of the same contrast beside it, and
-its stripes are short. Where views agree on texture, as they do on stripes of a wall, only this factor tells. The third
-is the probability of a normal error within :math:`\tau = 0.0025`, where u is the standard deviation across the
-line that half of its places do not exceed, over the usual distance: by its segments, or by the planes that meet in it
-where these tell more, as tread and riser do of the edge of a step that all images see from one height. The fourth is
-the share of normal residuals of r pixels root mean square within the width of an edge, a pixel: contours that move with
-the view and chords of curves fit no single line, and where segments of a curve are bowed their standard deviations, and
-with them r, say so.
+The first factor, that its segments belong together, is a logistic model of five quantities (:func:`line_evidence`).
+The outline of a round body is no edge, and moves with the view: its segments drift from any line that stands still, and
+images that show the body beside it do not show it where others do. The second, that they are no texture, is one of the
+prominence alone: contrast (:mod:`groma.features.contrast`) times relative length, since texture has stripes of the same
+contrast beside it, and its stripes are short. Where views agree on texture, as they do on stripes of a wall, only this
+factor tells. The third is the probability of a normal error within :math:`\tau = 0.0025`, where u is the standard
+deviation across the line that half of its places do not exceed, over the usual distance: by its segments, or by the
+planes that meet in it where these tell more, as tread and riser do of the edge of a step that all images see from one
+height. The fourth is the share of normal residuals of r pixels root mean square within the width of an edge, a pixel:
+chords of curves fit no single line, and where segments of a curve are bowed their standard deviations, and with them r,
+say so.
 
 No quantity depends on the unit of length or on how many pixels an image has. The weights were fitted on rendered scenes
 of boxes and round bodies whose edges are known exactly, and the probabilities compared with those of other scenes
@@ -32,7 +33,8 @@ from functools import partial
 import numpy as np
 import scipy  # its parts are imported when something of them is first used
 
-from groma._typing import BoolArray, FloatArray
+from groma._trees import kd_tree, nearest
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assembly_options import SURFACE_SIGMA_PX
 from groma.adjustment.terms.relations import lengths_per_pixel
 from groma.cameras import model as camera_model
@@ -40,15 +42,16 @@ from groma.execution import begin, map_in_threads
 from groma.features.segments import SEGMENTS
 from groma.gates import gate
 from groma.geometry import quaternion, segment2
-from groma.geometry.algebra import norm
+from groma.geometry.algebra import norm, ratio
 from groma.mapping.groups import num_distinct
 from groma.mapping.lines.options import MIN_LENGTH
-from groma.mapping.noise.landmarks import LineNoise, line_noise
+from groma.mapping.noise.landmarks import LineNoise, line_end_rows, line_noise
 from groma.scene import Scene
 
 #: The quantities, and the weight of each as ``benchmarks/line_confidence.py`` found it.
 WEIGHTS: dict[str, float] = {
-    "constant": 1.542, "spread": 1.262, "support": 2.695, "residual": -2.451, "prominence": 3.098,
+    "constant": 3.426, "spread": 0.962, "support": 1.557, "beside": 1.216, "residual": -1.246, "drift": -2.037,
+    "prominence": 3.149,
 }  # fmt: skip
 
 
@@ -70,6 +73,8 @@ GATES = ConfidenceGates()
 DEFAULT_CONFIDENCE = 0.5
 #: Smallest misfit and spread, below which they say nothing more.
 _MIN_MISFIT, _MIN_SPREAD = 0.3, 1e-4
+#: Shares of an information below which it is none: that of a line, and of the radius beside it (convention: rounding).
+_SINGULAR, _UNKNOWN = 1e-12, 1e-9
 #: Shares of a line at which it is asked how well it is known (cost: time).
 _PLACES = np.linspace(0.0, 1.0, 9)
 
@@ -108,7 +113,7 @@ def line_accuracy(
 
 
 def line_evidence(scene: Scene, noise: LineNoise | None = None) -> FloatArray:
-    r"""Return what the probability that there is an edge is computed from, (L, 5), in the order of ``WEIGHTS``.
+    r"""Return what the probability that there is an edge is computed from, (L, 7), in the order of ``WEIGHTS``.
 
     ``noise`` is that of the lines, if it is known.
 
@@ -117,22 +122,27 @@ def line_evidence(scene: Scene, noise: LineNoise | None = None) -> FloatArray:
     ``spread``      logarithm of :math:`\sqrt{\lambda}`, the smaller eigenvalue of the mean of :math:`n n^\top` over the
                     normals of its viewing planes: how far apart the views are, as the sine of an angle
     ``support``     log odds of an image showing it, among the images in whose frame it lies
+    ``beside``      the same among the images that show the points nearest to it
     ``residual``    logarithm of the root mean square of its residuals, pixels
+    ``drift``       logarithm of 1 + t, where t is how many standard deviations the radius is off zero of the cylinder
+                    whose outlines explain its segments best
     ``prominence``  mean over its segments of the logarithm of their contrast, plus that of its longest observed
                     segment over the median of those of all lines, less that of ``ConfidenceGates.texture``
     ==============  ===============================================================================================
     """
     seen, noise = scene.line_observations, line_noise(scene) if noise is None else noise
     images = num_distinct(seen.line_idx, seen.image_idx, scene.num_lines)
-    expected = np.maximum(_num_in_frame(scene), images)
+    absent, absent_beside = _num_absent(scene)
     longest = np.ones(scene.num_lines)
     np.maximum.at(longest, seen.line_idx, segment2.length(seen.segment))
     return np.column_stack(
         [
             np.ones(scene.num_lines),
             np.log(_spread(scene, noise)),
-            np.log((images + 0.5) / (expected - images + 0.5)),
+            np.log((images + 0.5) / (absent + 0.5)),
+            np.log((images + 0.5) / (absent_beside + 0.5)),
             np.log(_residual_px(scene, noise)),
+            np.log1p(np.abs(_drift(scene, noise))),
             _log_contrast(scene) + np.log(longest / (np.median(longest) if len(longest) else 1.0) / GATES.texture),
         ]
     )
@@ -202,12 +212,53 @@ def _spread(scene: Scene, noise: LineNoise) -> FloatArray:
     return np.sqrt(np.maximum(smaller, _MIN_SPREAD**2))
 
 
-def _num_in_frame(scene: Scene) -> FloatArray:
-    """(L,) number of images in whose frame a line lies whole and is long enough to be found."""
-    found = np.zeros(scene.num_lines)
-    for inside in map_in_threads(partial(_in_frame, scene), range(scene.num_images)):
-        found += inside
-    return found
+def _drift(scene: Scene, noise: LineNoise) -> FloatArray:
+    """(L,) radius of the cylinder whose outlines explain the segments of a line best, in standard deviations."""
+    ends, seen = line_end_rows(scene), scene.line_observations
+    weight = ends.good / (noise.sigma_px * seen.sigma)[:, None]
+    row, share = np.where(ends.good[..., None], ends.row, 0.0), np.where(ends.good, ends.share, 0.0)[..., None]
+    away = np.where(ends.good, ends.residual, 0.0)
+    # Columns: both ends of the line, the radius, which moves the outline to the same side in all views, the residual.
+    columns = np.concatenate([(1.0 - share) * row, share * row, norm(row)[..., None], away[..., None]], axis=2)
+    columns *= weight[..., None]
+    sums = np.zeros((scene.num_lines, 6, 6))
+    np.add.at(sums, seen.line_idx, np.einsum("nei,nej->nij", columns, columns))
+    line, both = sums[:, :4, :4], sums[:, :4, 4:]
+    line = line + _SINGULAR * np.trace(line, axis1=1, axis2=2)[:, None, None] * np.eye(4) + 1e-300 * np.eye(4)
+    left = sums[:, 4:, 4:] - np.swapaxes(both, 1, 2) @ np.linalg.solve(line, both)
+    information, known = left[:, 0, 0], left[:, 0, 0] > _UNKNOWN * sums[:, 4, 4]
+    return ratio(left[:, 0, 1], np.sqrt(np.maximum(information, 0.0)), known, 0.0)
+
+
+def _num_absent(scene: Scene) -> tuple[FloatArray, FloatArray]:
+    """(L,) numbers of images that do not show a line: those in whose frame it lies, and those that show what is beside.
+
+    What is beside a line is known by points, which fewer images see than the surface around them; how many fewer is
+    known from the images that do show lines.
+    """
+    points = np.unique(scene.point_observations.point_idx)
+    first, last = scene.lines.segments.transpose(1, 0, 2)
+    places = (first[:, None] + _PLACES[:, None] * (last - first)[:, None]).reshape(-1, 3)
+    beside = np.zeros((scene.num_lines, 0), np.int64)
+    if len(points):
+        beside = points[nearest(kd_tree(scene.points.xyz[points]), places, 1)[1].reshape(-1, len(_PLACES))]
+    absent, told, shown = np.zeros(scene.num_lines), np.zeros(scene.num_lines), np.zeros(2)
+    for images, points_told, numbers in map_in_threads(partial(_absent, scene, beside), range(scene.num_images)):
+        absent, told, shown = absent + images, told + points_told, shown + numbers
+    usual = shown[0] / max(shown[1], 1.0)
+    return absent, np.minimum(ratio(told, usual, usual > 0.0, np.inf), absent)
+
+
+def _absent(scene: Scene, beside: IntArray, image: int) -> tuple[BoolArray, IntArray, list[int]]:
+    """Return which lines (L,) an image does not show though they lie in its frame, how many points beside these it
+    does; and how many beside lines that it shows, with the number of these lines.
+    """
+    seen, points = scene.line_observations, scene.point_observations
+    shown, told = np.zeros(scene.num_lines, np.bool_), np.zeros(scene.num_points, np.bool_)
+    shown[seen.line_idx[seen.image_idx == image]] = True
+    told[points.point_idx[points.image_idx == image]] = True
+    absent, count = _in_frame(scene, image) & ~shown, told[beside].sum(axis=1)
+    return absent, count * absent, [int(count[shown].sum()), int(shown.sum())]
 
 
 def _in_frame(scene: Scene, image: int) -> BoolArray:
