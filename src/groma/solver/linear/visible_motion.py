@@ -76,8 +76,8 @@ def observers(problem: Problem, name: str, centers: dict[str, FloatArray]) -> Ob
             poses.append(from_pose[0].index.astype(np.int64) + offsets[from_pose[0].group])
     variable, pose = np.concatenate(variables), np.concatenate(poses)
     group, count, seen_from = problem.variables[name], np.bincount(variable, minlength=number), all_centers[pose]
-    middle = np.column_stack([np.bincount(variable, column, number) for column in seen_from.T])
-    middle /= np.maximum(count, 1)[:, None]
+    sums = [np.bincount(variable, column, number) for column in seen_from.T]
+    middle = np.column_stack(sums) / np.maximum(count, 1)[:, None]
     away = nearest_place(group.manifold, group.state, middle)[variable] - seen_from
     distance = np.bincount(variable, norm(away), number) / np.maximum(count, 1)
     fallback = float(np.median(distance[count > 0])) if (count > 0).any() else 1.0
