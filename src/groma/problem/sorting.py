@@ -109,7 +109,9 @@ def distinct_pairs(groups: IntArray, values: IntArray, num_groups: int) -> tuple
     slot = np.cumsum(is_new, dtype=np.int32)
     slot -= 1
     first = np.flatnonzero(is_new)
-    return slot, np.searchsorted(groups[first], np.arange(num_groups + 1)), values[first].astype(np.int32)
+    pointer = np.zeros(num_groups + 1, np.int64)
+    np.cumsum(np.bincount(groups[first], minlength=num_groups), out=pointer[1:])
+    return slot, pointer, values[first].astype(np.int32)
 
 
 class PairTable:
