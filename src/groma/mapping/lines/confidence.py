@@ -29,6 +29,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 import scipy  # its parts are imported when something of them is first used
@@ -43,7 +44,7 @@ from groma.features.segments import SEGMENTS
 from groma.gates import gate
 from groma.geometry import quaternion, segment2
 from groma.geometry.algebra import norm, ratio
-from groma.mapping.groups import num_distinct
+from groma.mapping.groups import grouped, num_distinct
 from groma.mapping.lines.options import MIN_LENGTH
 from groma.mapping.noise.landmarks import LineNoise, line_end_rows, line_noise
 from groma.scene import Scene
@@ -236,27 +237,39 @@ def _num_absent(scene: Scene) -> tuple[FloatArray, FloatArray]:
     What is beside a line is known by points, which fewer images see than the surface around them; how many fewer is
     known from the images that do show lines.
     """
-    points = np.unique(scene.point_observations.point_idx)
+    seen, marks = scene.line_observations, scene.point_observations
+    points = np.unique(marks.point_idx)
     first, last = scene.lines.segments.transpose(1, 0, 2)
     places = (first[:, None] + _PLACES[:, None] * (last - first)[:, None]).reshape(-1, 3)
     beside = np.zeros((scene.num_lines, 0), np.int64)
     if len(points):
         beside = points[nearest(kd_tree(scene.points.xyz[points]), places, 1)[1].reshape(-1, len(_PLACES))]
+    lines_of, points_of = (
+        _by_image(image, landmark, scene.num_images)
+        for image, landmark in ((seen.image_idx, seen.line_idx), (marks.image_idx, marks.point_idx))
+    )
     absent, told, shown = np.zeros(scene.num_lines), np.zeros(scene.num_lines), np.zeros(2)
-    for images, points_told, numbers in map_in_threads(partial(_absent, scene, beside), range(scene.num_images)):
+    images_seen = list(zip(range(scene.num_images), lines_of, points_of, strict=True))
+    for images, points_told, numbers in map_in_threads(partial(_absent, scene, beside), images_seen):
         absent, told, shown = absent + images, told + points_told, shown + numbers
     usual = shown[0] / max(shown[1], 1.0)
     return absent, np.minimum(ratio(told, usual, usual > 0.0, np.inf), absent)
 
 
-def _absent(scene: Scene, beside: IntArray, image: int) -> tuple[BoolArray, IntArray, list[int]]:
-    """Return which lines (L,) an image does not show though they lie in its frame, how many points beside these it
-    does; and how many beside lines that it shows, with the number of these lines.
+def _by_image(image: IntArray, landmark: IntArray, num_images: int) -> list[IntArray]:
+    order, pointers = grouped(image, num_images)
+    return [landmark[order[begin:end]] for begin, end in pairwise(pointers)]
+
+
+def _absent(
+    scene: Scene, beside: IntArray, of_image: tuple[int, IntArray, IntArray]
+) -> tuple[BoolArray, IntArray, list[int]]:
+    """Return which lines (L,) an image, with the lines and points that it shows, does not show though they lie in its
+    frame, how many points beside these it does; and how many beside lines that it shows, with the number of these.
     """
-    seen, points = scene.line_observations, scene.point_observations
+    image, lines, points = of_image
     shown, told = np.zeros(scene.num_lines, np.bool_), np.zeros(scene.num_points, np.bool_)
-    shown[seen.line_idx[seen.image_idx == image]] = True
-    told[points.point_idx[points.image_idx == image]] = True
+    shown[lines], told[points] = True, True
     absent, count = _in_frame(scene, image) & ~shown, told[beside].sum(axis=1)
     return absent, count * absent, [int(count[shown].sum()), int(shown.sum())]
 
