@@ -9,7 +9,7 @@ from scipy.stats import binom, nbinom
 from worlds import CAMERA, make_world, pose_of
 
 from groma.geometry import quaternion
-from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose, pose_from_matches
+from groma.localization.pose.absolute_pose import MapQuestions, PoseOptions, estimate_absolute_pose, pose_from_matches
 from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
@@ -53,7 +53,7 @@ def test_poses_with_too_few_votes_are_not_judged():
     asked = []
     for enough in (votes, votes + 1):
         expected = lambda best, used: asked.append(best) or Shown(9.0, 0.0)  # noqa: E731
-        found = pose_from_matches(CAMERA, matches, expected=expected, enough=enough)
+        found = pose_from_matches(CAMERA, matches, enough=enough, of_map=MapQuestions(expected=expected))
         assert (found.status, len(asked)) == ("localized" if enough == votes else "failed", 1)
 
 
@@ -80,7 +80,9 @@ def test_what_speaks_against_a_pose_is_told_from_too_few_matches():
     world = make_world(np.random.default_rng(2), points=200)
     matches = Matches(world.points2d, world.points3d)
     for parts, status in (((9.0, 0.0), "localized"), ((1.0, 9.0), "uncertain")):
-        found = pose_from_matches(CAMERA, matches, expected=lambda best, used, parts=parts: Shown(*parts))
+        found = pose_from_matches(
+            CAMERA, matches, of_map=MapQuestions(expected=lambda best, used, parts=parts: Shown(*parts))
+        )
         assert (found.status, found.contradicted) == (status, status == "uncertain")
     again = np.concatenate([world.points3d, world.points3d + np.array([1.5, 0.0, 0.0])])
     two = estimate_absolute_pose(CAMERA, np.concatenate([world.points2d, world.points2d]), again)
@@ -107,7 +109,7 @@ def test_what_only_one_of_two_places_has_decides_between_them(known):
     def nearest(pose):
         return int(np.argmin([np.linalg.norm(one[4:] - pose[4:]) for one in poses]))
 
-    found = pose_from_matches(CAMERA, matches, guided=lambda best: matches, expected=expected)
+    found = pose_from_matches(CAMERA, matches, of_map=MapQuestions(guided=lambda best: matches, expected=expected))
     if len(known) == 1:
         assert (found.status, nearest(found.cam_from_world)) == ("localized", known[0])
     else:
@@ -173,8 +175,10 @@ def test_what_is_found_at_a_place_that_is_known_is_no_piece_of_another():
             CAMERA,
             matches,
             PoseOptions(look_for_rival=False),
-            guided=lambda best, near=near: near,
-            expected=lambda best, used, telling=telling: Shown(9.0, 0.0, (0, telling), (0.0, 20.0)),
+            of_map=MapQuestions(
+                guided=lambda best, near=near: near,
+                expected=lambda best, used, telling=telling: Shown(9.0, 0.0, (0, telling), (0.0, 20.0)),
+            ),
         )
         assert found.status == status, found.sentence
 
@@ -185,8 +189,8 @@ def test_what_repeats_elsewhere_is_no_piece():
     right = world.points2d[:, 0] > CAMERA.width / 2
     matches = Matches(world.points2d + right[:, None] * np.array([0.0, 150.0]), world.points3d)
     for telling, status in ((np.ones(300, bool), "uncertain"), (~right, "localized"), (right, "uncertain")):
-        options = PoseOptions(look_for_rival=False)
-        found = pose_from_matches(CAMERA, matches, options, telling=lambda used, telling=telling: telling)
+        of_map = MapQuestions(telling=lambda used, telling=telling: telling)
+        found = pose_from_matches(CAMERA, matches, PoseOptions(look_for_rival=False), of_map=of_map)
         assert found.status == status, found.sentence
 
 

@@ -35,6 +35,7 @@ from groma.localization.map_index import images_told, kept_index
 from groma.localization.pose.absolute_pose import (
     UNKNOWN_LENS,
     AbsolutePose,
+    MapQuestions,
     MirrorQuestions,
     PoseOptions,
     pose_from_matches,
@@ -281,10 +282,8 @@ class Localizer:
             query, part, camera, self.scene, self.index, lambda points: matched(points, self._alike(points)),
             self.options.gates.near,
         )  # fmt: skip
-        asked = MirrorQuestions(mirror.matches, closest)
-        pose = pose_from_matches(
-            camera, matches, options, max(len(images), 1), guided, asked, expected, enough, common, telling
-        )
+        of_map = MapQuestions(guided, MirrorQuestions(mirror.matches, closest), expected, common, telling)
+        pose = pose_from_matches(camera, matches, options, max(len(images), 1), enough, of_map)
         return pose, seen_in_them(pose.matches)
 
     def _own_camera(self, camera: QueryCamera) -> int | None:

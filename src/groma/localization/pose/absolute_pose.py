@@ -79,6 +79,23 @@ class MirrorQuestions:
     closest: Callable[[Refined, Matches, Refined], tuple[int, int]]
 
 
+@dataclass(frozen=True)
+class MapQuestions:
+    """What is asked of the map that matches are of; what is None is not known."""
+
+    #: More matches once a pose is near; they refine it, and are those that the result tells of. They are no evidence
+    #: that the place is right, because they were looked for where it says.
+    guided: Callable[[Refined], Matches] | None = None
+    #: The mirror image of the photograph.
+    mirror: MirrorQuestions | None = None
+    #: How much of what a pose puts into the image is there. What only one place has decides between two.
+    expected: Callable[[Refined, Matches], Shown] | None = None
+    #: What errors of the poses and calibrations of the map add to the covariance.
+    common: Callable[[Refined, Matches], FloatArray] | None = None
+    #: Which matches of points show what only one place of the map has; None: all may.
+    telling: Callable[[Matches], BoolArray] | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class AbsolutePose:
     """An estimated pose, its covariance and the outcome of its tests."""
@@ -193,12 +210,8 @@ def pose_from_matches(
     matches: Matches,
     options: PoseOptions | None = None,
     places: int = 1,
-    guided: Callable[[Refined], Matches] | None = None,
-    mirror: MirrorQuestions | None = None,
-    expected: Callable[[Refined, Matches], Shown] | None = None,
     enough: int = 0,
-    common: Callable[[Refined, Matches], FloatArray] | None = None,
-    telling: Callable[[Matches], BoolArray] | None = None,
+    of_map: MapQuestions = MapQuestions(),
 ) -> AbsolutePose:
     """Estimate a pose as :func:`estimate_absolute_pose` does.
 
@@ -208,21 +221,12 @@ def pose_from_matches(
         See there.
     places
         Parts of a map that the matches were looked for in; chance has so many opportunities.
-    guided : callable, optional
-        Returns more matches once a pose is near; they refine it, and are those that the result tells of. They are no
-        evidence that the place is right, because they were looked for where it says.
-    mirror : MirrorQuestions, optional
-        What is asked of the mirror image of the photograph.
-    expected : callable, optional
-        Returns how much of what a pose puts into the image is there. What only one place has decides between two.
     enough
         A pose with fewer votes is of no interest: it is ``failed``, without asking what else speaks against it.
-    common : callable, optional
-        Returns what errors of the poses and calibrations of the map add to the covariance.
-    telling : callable, optional
-        Returns which matches of points show what only one place of the map has; by default all may.
+    of_map : MapQuestions
+        What is asked of the map.
     """
-    options = options or PoseOptions()
+    options, guided, expected = options or PoseOptions(), of_map.guided, of_map.expected
     best = _best(camera, matches, options)
     if best is None:
         return _failed(camera, matches)
@@ -245,8 +249,8 @@ def pose_from_matches(
     if here.evidence.agree < enough:
         return _failed(camera, matches)
     other = _rival(matches, best, options, places, first) if options.look_for_rival and first.significant else None
-    here, there, others = weighed(here, other, near if guided else None, matches, expected is not None, telling)
-    return _judged(here, others, None if there is None else there.best.pose, matches, options, mirror, common)
+    here, there, others = weighed(here, other, near if guided else None, matches, expected is not None, of_map.telling)
+    return _judged(here, others, None if there is None else there.best.pose, matches, options, of_map)
 
 
 def _judged(
@@ -255,19 +259,18 @@ def _judged(
     rival: FloatArray | None,
     matches: Matches,
     options: PoseOptions,
-    mirror: MirrorQuestions | None,
-    common: Callable[[Refined, Matches], FloatArray] | None,
+    of_map: MapQuestions,
 ) -> AbsolutePose:
     """A pose and what is said of it."""
     best, used = here.best, here.used
     covariance = best.covariance(used)
-    if common is not None and np.isfinite(covariance).all():
-        covariance = covariance + common(best, used)
+    if of_map.common is not None and np.isfinite(covariance).all():
+        covariance = covariance + of_map.common(best, used)
     verdict = judge(best, covariance, median_distance(best.pose, _seen(used, best)), here.evidence, others)
     if verdict.status == "localized":
         verdict = doubted_if_missing(verdict, here.shown.parts, here.shown.missing)
-    if mirror is not None and verdict.status == "localized":
-        verdict = _unless_mirrored(verdict, here, mirror, matches, options)
+    if of_map.mirror is not None and verdict.status == "localized":
+        verdict = _unless_mirrored(verdict, here, of_map.mirror, matches, options)
     if not options.refine_lens and verdict.status == "localized":
         verdict = doubted_if_other_lens(verdict, lens_step(best, used, _errors(used, options)))
     failed = verdict.status == "failed"
