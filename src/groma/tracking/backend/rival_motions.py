@@ -10,10 +10,12 @@ right track may be; more are not chance.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
-from scipy.stats import binom
 
 from groma._typing import FloatArray
+from groma.estimators.association import log10_binomial_tail
 from groma.gates import NORMAL
 from groma.geometry import se3
 from groma.tracking.backend.described_tracks import described_tracks
@@ -32,7 +34,7 @@ def motion_that_does_not_fit(track_map: TrackMap, camera: TrackCamera, gates: Tr
     begins = np.unique(np.linspace(0, len(living) - 3, _PLACES).astype(int)) if len(living) > 2 else []
     told = [_is_ruled_out(living[k : k + 3], camera, gates, sigma) for k in begins]
     looked, out = sum(one is not None for one in told), sum(one is True for one in told)
-    if not binom.sf(out - 1, looked, NORMAL.false_alarm) < NORMAL.never:
+    if not log10_binomial_tail(out - 1, looked, NORMAL.false_alarm) < math.log10(NORMAL.never):
         return []
     return [
         f"The motion of the camera is doubtful: at {out} of {looked} places along the track features that were matched "
