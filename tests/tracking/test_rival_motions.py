@@ -10,7 +10,6 @@ from groma.tracking import Tracker, TrackOptions
 from groma.tracking.backend.rival_motions import motion_that_does_not_fit
 from groma.tracking.map.track_map import TrackMap
 
-pytestmark = pytest.mark.kernels
 OPTIONS = TrackOptions(threaded=False, keyframe_motion=0.06, keyframe_turn=0.1)
 
 
