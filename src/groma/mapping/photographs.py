@@ -142,17 +142,19 @@ def smaller_copies(folder: Path, sizes: Mapping[str, tuple[int, int]]) -> dict[s
         Width and height by name.
     """
     names = sorted(sizes, key=lambda name: (-math.prod(sizes[name]), len(name), name))
-    size = np.array([sizes[name] for name in names], float).reshape(-1, 2)
-    ratio = size / size[:, None]
+    size, kind = np.unique(np.reshape([sizes[name] for name in names], (-1, 2)), axis=0, return_inverse=True)
+    ratio, kind = size / size[:, None], kind.ravel()
     # derived from sizes that are whole pixels
     alike = (np.abs(ratio[..., 0] - ratio[..., 1]) <= (1.0 / size).sum(axis=1)[:, None]) & (ratio < 1.0).all(axis=2)
-    rows = np.flatnonzero(alike.any(axis=0) | alike.any(axis=1))
+    rows = np.flatnonzero((alike.any(axis=0) | alike.any(axis=1))[kind])
+    if not len(rows):
+        return {}
     glance = np.zeros((len(names), COPIES.glance**2))
     for row, numbers in zip(rows, map_work(_glance, [folder / names[row] for row in rows]), strict=True):
         glance[row] = numbers
     found: dict[str, str] = {}
     for row in rows:
-        likeness = np.where(alike[:, row], glance @ glance[row], 0.0)
+        likeness = np.where(alike[kind, kind[row]], glance @ glance[row], 0.0)
         for other in np.argsort(-likeness, kind="stable")[: COPIES.tries]:
             if likeness[other] < COPIES.glance_alike:
                 break
