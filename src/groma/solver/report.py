@@ -152,7 +152,8 @@ def warn_of_oddities(report: SolveReport) -> None:
     """Put into words what may be wrong."""
     for name, count in report.num_degenerate.items():
         report.warnings.append(
-            f"Left out: {counted(count, 'factors')} of type {name!r} that could not be evaluated (degenerate geometry)."
+            f"Left out: {counted(count, name.replace('_', ' ') + ' factors')} that could not be evaluated "
+            "(a point behind its camera, a line through its centre)."
         )
     if report.num_underdetermined_landmarks:
         report.warnings.append(
