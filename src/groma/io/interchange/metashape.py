@@ -124,7 +124,7 @@ def _east_north_up(center: FloatArray) -> FloatArray:
     up = center * (1.0, 1.0, 1.0 / _FLATTENED)  # the normal of the ellipsoid
     up /= np.linalg.norm(up)
     east = np.array([-up[1], up[0], 0.0]) / np.hypot(up[0], up[1])
-    north: FloatArray = np.cross(up, east)
+    north = np.cross(up, east).astype(np.float64)
     return np.stack([east, north, up])
 
 
