@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import test_bundler
+import test_meshroom
+import test_metashape
 import test_nvm
 import test_openmvg
 import test_opensfm
@@ -73,6 +75,13 @@ def _interchange() -> Iterator[Made]:
         values = test_openmvg.KINDS[kind][1] if kind != "spherical" else []
         document = json.dumps(test_openmvg.document(true, kind, values), indent=1).encode()
         yield f"openmvg_{kind}", {"sfm_data.json": document}, read_scene
+    for kind, version in (("pinhole_brown_t2", "1.0.0"), ("fisheye", "1.2.6")):
+        document = json.dumps(test_meshroom.document(true, kind, test_openmvg.KINDS[kind][1], version), indent=1)
+        yield f"meshroom_{kind}", {"cameras.sfm": document.encode()}, one(read_scene, "cameras.sfm")
+    for kind in ("pinhole_brown_t2", "fisheye"):
+        said = test_metashape.LENSES[kind][0], "fisheye" if kind == "fisheye" else "frame", 'PROJCS["UTM"]'
+        document = test_metashape.document(true.rotation, true.center, *said)
+        yield f"metashape_{kind}", {"a.xml": document.encode()}, one(read_scene, "a.xml")
     for kind in ("perspective", "brown", "fisheye_opencv"):
         said, _ = test_opensfm.CAMERAS[kind]
         model = test_opensfm.reconstruction(true, kind, said)

@@ -11,6 +11,8 @@ from groma.io.exports.gltf import write_gltf
 from groma.io.exports.recording import write_recording
 from groma.io.g2o import read_g2o, write_g2o
 from groma.io.interchange.bundler import read_bundler
+from groma.io.interchange.meshroom import read_meshroom
+from groma.io.interchange.metashape import read_metashape
 from groma.io.interchange.nvm import read_nvm
 from groma.io.interchange.openmvg import read_openmvg
 from groma.io.interchange.opensfm import OpenSfmReconstruction, read_opensfm, read_opensfm_reconstructions
@@ -36,6 +38,8 @@ __all__ = [
     "read_bundler",
     "read_colmap",
     "read_g2o",
+    "read_meshroom",
+    "read_metashape",
     "read_nvm",
     "read_openmvg",
     "read_opensfm",

@@ -62,6 +62,8 @@ TRANSFORMS = PoseConvention(
 )
 OPENSFM = PoseConvention("reconstruction.json: OpenSfM, OpenDroneMap", "cam_from_world", "axis and angle", "shift")
 OPENMVG = PoseConvention("sfm_data.json: OpenMVG", "cam_from_world", "matrix", "camera centre")
+MESHROOM = PoseConvention("cameras.sfm: Meshroom", "world_from_cam", "matrix", "camera centre")
+METASHAPE = PoseConvention("cameras.xml: Metashape", "world_from_cam", "matrix", "camera centre")
 NVM = PoseConvention("NVM_V3: VisualSFM", "cam_from_world", "qw qx qy qz", "camera centre")
 NVM_MATRIX = PoseConvention("NVM_V3_R9T: VisualSFM", "cam_from_world", "matrix", "shift")
 BUNDLER = PoseConvention("bundle.out: Bundler", "cam_from_world", "matrix", "shift", "OpenGL")
@@ -77,5 +79,6 @@ G2O = PoseConvention("g2o: VERTEX_SE3:QUAT id x y z qx qy qz qw", "world_from_ca
 
 #: All of them, as the documentation lists them.
 POSE_CONVENTIONS = (
-    COLMAP, TRANSFORMS, OPENSFM, OPENMVG, NVM, NVM_MATRIX, BUNDLER, BAL, NAMED, TUM, KITTI, LOG, EUROC, G2O,
+    COLMAP, TRANSFORMS, OPENSFM, OPENMVG, MESHROOM, METASHAPE, NVM, NVM_MATRIX, BUNDLER, BAL, NAMED, TUM, KITTI, LOG,
+    EUROC, G2O,
 )  # fmt: skip

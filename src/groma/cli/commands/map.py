@@ -280,12 +280,16 @@ def _start(
 ) -> "tuple[Scene | None, MapOptions]":
     """Return the initial scene, None if there are only photographs, and the options adapted to its calibration."""
     from groma.io import read_scene
-    from groma.mapping.posed.given import scene_at_poses
+    from groma.mapping.posed.given import in_pixels_of, scene_at_poses
 
     if model is None:
         options.point_model()  # refuses a wrong name now
     if poses is None:
-        return (None if model is None else read_scene(model)), options
+        if model is None:
+            return None, options
+        scene, scaled = in_pixels_of(read_scene(model), images)
+        console.say(*scaled)
+        return scene, options
     given = scene_at_poses(images, poses, options.point_model())
     console.say(*given.sentences)
     if given.calibrated:  # a model that came with parameters is the one of the scene

@@ -47,6 +47,7 @@ Input = Annotated[
     Path,
     typer.Argument(
         metavar="INPUT",
-        help="COLMAP model folder, groma archive (.npz), BAL, Bundler, VisualSFM, OpenMVG, OpenSfM or nerfstudio file.",
+        help="COLMAP model folder, groma archive (.npz), BAL, Bundler, VisualSFM, OpenMVG, Meshroom, Metashape, "
+        "OpenSfM or nerfstudio file.",
     ),
 ]
