@@ -14,15 +14,19 @@ are to be checked.
 from __future__ import annotations
 
 import operator
-from functools import cache, cached_property
+from collections import Counter
+from collections.abc import Callable
+from functools import cache, cached_property, partial
 from typing import Any
 
 from llvmlite import ir as llvm
-from numba.core import cgutils, types
+from numba.core import analysis, cgutils, ir, types
 from numba.core.compiler_machinery import register_pass
 from numba.core.debuginfo import DummyDIBuilder
 from numba.core.lowering import Lower
 from numba.core.typed_passes import NativeLowering as NumbaLowering
+
+from groma._kernels.shortcuts import item
 
 _WORD = llvm.IntType(64)
 _ZERO, _HALF = llvm.Constant(_WORD, 0), llvm.IntType(32)
@@ -31,6 +35,22 @@ _DATA, _SHAPE, _STRIDES = 4, 5, 6
 #: What a loop over a range is made of, and numbers of arrays by fixed indices.
 _PARTS = {"pair_first": 0, "pair_second": 1}
 _COUNTING = ("static_getitem", "call", "getiter", "iternext", *_PARTS)
+#: Numbers whose sums, products and comparisons are one instruction each, and what it is called.
+_REAL, _WHOLE = frozenset((types.float32, types.float64)), frozenset((types.int32, types.int64))
+_COMPUTED = {
+    operator.add: ("fadd", "add"),
+    operator.sub: ("fsub", "sub"),
+    operator.mul: ("fmul", "mul"),
+    operator.truediv: ("fdiv", ""),
+}
+_COMPARED = {
+    operator.lt: "<",
+    operator.le: "<=",
+    operator.gt: ">",
+    operator.ge: ">=",
+    operator.eq: "==",
+    operator.ne: "!=",
+}
 
 
 def _kinds(array: Any, index: Any) -> tuple[Any, ...] | None:
@@ -42,13 +62,32 @@ def _kinds(array: Any, index: Any) -> tuple[Any, ...] | None:
     return kinds if fits else None
 
 
-def _item(value: Any, place: int) -> Any:
-    """Return what was put at a place of a tuple, if that can be seen; None otherwise."""
-    while isinstance(value, llvm.instructions.InsertValue):
-        if value.indices[0] == place:
-            return value.operands[1]
-        value = value.operands[0]
-    return None
+def _instruction(build: Any, op: Any, signature: Any) -> Callable[[Any, Any], Any] | None:
+    """Return what makes the instruction for an operation on two numbers of one kind; None for any other operation."""
+    kind, other = signature.args
+    is_real = kind in _REAL
+    if kind != other or not (is_real or kind in _WHOLE):
+        return None
+    if op in _COMPARED and signature.return_type == types.boolean:
+        of_reals = build.fcmp_unordered if op is operator.ne else build.fcmp_ordered
+        return partial(of_reals if is_real else build.icmp_signed, _COMPARED[op])
+    name = _COMPUTED[op][not is_real] if op in _COMPUTED and signature.return_type == kind else ""
+    return partial(getattr(build, name), flags=() if is_real else ("nsw",)) if name else None
+
+
+def _assigned_before_use(blocks: dict[int, Any]) -> set[str]:
+    """Return the variables that are assigned once, in a block through which every way to their uses leads."""
+    assigned = Counter(found.target.name for block in blocks.values() for found in block.find_insts(ir.Assign))
+    uses, definitions = analysis.compute_use_defs(blocks)
+    above = analysis.compute_cfg_from_blocks(blocks).dominators()
+    once = {name: offset for offset in blocks for name in definitions[offset] if assigned[name] == 1}
+    elsewhere = {name for offset in blocks for name in uses[offset] if not _leads(once.get(name), offset, above)}
+    return {name for name in once if name not in elsewhere} - analysis.must_use_alloca(blocks)
+
+
+def _leads(start: int | None, offset: int, above: dict[int, set[int]]) -> bool:
+    """Whether every way to a block leads through another, which is before it."""
+    return start is not None and start < offset and start in above[offset]
 
 
 @cache
@@ -78,12 +117,34 @@ class _Lower(Lower):
         if self._is_counted(typ):
             super().decref(typ, val)
 
+    def _find_singly_assigned_variable(self) -> None:
+        """Find variables that stay in registers, which Numba grants inside one block only.
+
+        Arrays are in memory as well, where their references are counted.
+        """
+        super()._find_singly_assigned_variable()
+        self._held: set[str] = set()
+        self._values: dict[str, Any] = {}
+        identity = self.func_ir.func_id
+        if self._is_plain and not identity.is_generator and not identity.code.co_exceptiontable:
+            found = _assigned_before_use(self.blocks)
+            self._held = {name for name in found - self._singly_assigned_vars if self._is_counted(self.typeof(name))}
+            self._singly_assigned_vars |= found - self._held
+
+    def loadvar(self, name: str) -> Any:
+        """Return the value of a variable."""
+        return self._values[name] if name in self._values else super().loadvar(name)
+
     def storevar(self, value: Any, name: str, argidx: int | None = None) -> None:
         """Store a number without reading what was there before."""
         kind = self.typeof(name)
         if not self._is_plain or (argidx is None and self._is_counted(kind)):
             super().storevar(value, name, argidx)
+            if name in self._held:
+                self._values[name] = value
             return
+        if name in self._held:
+            self._values[name] = value
         self._alloca_var(name, kind)
         if name in self._singly_assigned_vars and not self._disable_sroa_like_opt:
             self._blk_local_varmap[name] = value
@@ -122,22 +183,26 @@ class _Lower(Lower):
         return super().lower_expr(resty, expr)
 
     def lower_binop(self, resty: Any, expr: Any, op: Any) -> Any:
-        """Square by a product, and divide complex numbers as NumPy does.
+        """Compute with numbers by one instruction, square by a product, and divide complex numbers as NumPy does.
 
         Numba has a loop for powers, and an error for complex division by zero, whatever it is told.
         """
         signature = self.fndesc.calltypes[expr]
+        raises = self.context.error_model.raise_on_fp_zero_division
+        instruction = None if raises else _instruction(self.builder, op, signature)
         kind, count = signature.return_type, self.typeof(expr.rhs.name)
         is_square = op is operator.pow and isinstance(count, types.IntegerLiteral) and count.literal_value == 2
         is_square &= isinstance(kind, types.Float | types.Integer) and kind == signature.args[0]
-        if not is_square and not (op is operator.truediv and isinstance(kind, types.Complex)):
+        if not is_square and instruction is None and not (op is operator.truediv and isinstance(kind, types.Complex)):
             return super().lower_binop(resty, expr, op)
         first, second = (
             self.context.cast(self.builder, self.loadvar(side.name), self.typeof(side.name), wanted)
             for side, wanted in zip((expr.lhs, expr.rhs), signature.args, strict=True)
         )
         build: Any = self.builder
-        if is_square:
+        if instruction is not None:
+            found = instruction(first, second)
+        elif is_square:
             found = (build.fmul if isinstance(kind, types.Float) else build.mul)(first, first)
         else:
             from numba.np.npyfuncs import np_complex_div_impl
@@ -189,7 +254,7 @@ class _Lower(Lower):
 
     def _part(self, value: Any, place: int) -> Any:
         """Return what is at a place of a tuple."""
-        seen = _item(value, place)
+        seen = item(value, place)
         return self.builder.extract_value(value, place) if seen is None else seen
 
     def _filled(self, kind: Any, parts: Any) -> Any:
@@ -250,7 +315,7 @@ class _Lower(Lower):
         is_one = not isinstance(self.typeof(index_name), types.BaseTuple)
         indices = []
         for axis, kind in enumerate(kinds):
-            given = index if is_one else _item(index, axis)
+            given = index if is_one else item(index, axis)
             given = build.extract_value(index, axis) if given is None else given
             indices.append(self._from_start(given, kind, name, axis))
         if array.layout == "A":
@@ -289,8 +354,8 @@ class _Lower(Lower):
 
     def _field(self, name: str, *path: int) -> Any:
         """Return a field of the description of an array."""
-        if name in self._blk_local_varmap and not self._disable_sroa_like_opt:
-            return self.builder.extract_value(self._blk_local_varmap[name], path)
+        if name in self._values or (name in self._blk_local_varmap and not self._disable_sroa_like_opt):
+            return self.builder.extract_value(self.loadvar(name), path)
         steps = [llvm.Constant(_HALF, step) for step in (0, *path)]
         return self.builder.load(self.builder.gep(self.getvar(name), steps, inbounds=True))
 

@@ -28,9 +28,10 @@ from typing import Any
 
 import llvmlite.binding as llvm
 from llvmlite import ir
-from numba.core import event, types
+from numba.core import base, event, lowering, typeinfer, types
 from numba.core.base import BaseContext
 from numba.core.compiler_machinery import register_pass
+from numba.core.errors import new_error_context
 from numba.core.runtime.context import NRTContext
 from numba.core.targetconfig import TargetConfig
 from numba.core.typed_passes import NopythonTypeInference
@@ -47,6 +48,8 @@ _meanings: dict[Any, tuple[Any, Any]] = {}
 #: What Numba calls the events around each call of LLVM.
 _LLVM_CALLS = "numba:llvm_lock"
 _call_type, _find_counts, _refresh = BaseFunction.get_call_type, NRTContext.get_meminfos, BaseContext.refresh
+_TRUTH = ir.IntType(1)
+_extract, _has_place = ir.IRBuilder.extract_value, cache(base._has_loc)
 
 
 def _is_simple(kind: Any) -> bool:
@@ -156,6 +159,41 @@ def _options(self: Any) -> dict[str, Any]:
     return {**_defaults(type(self)), **self._values}
 
 
+def _extracted(self: Any, agg: Any, idx: Any, name: str = "") -> Any:
+    """Take the place of :meth:`IRBuilder.extract_value`: what was put into a tuple need not be taken out again.
+
+    Whether a loop goes on is taken out: LLVM would simplify its branches sooner, to loops of another shape.
+    """
+    path = list(idx) if isinstance(idx, tuple | list) else [idx]
+    while path and (seen := item(agg, path[0])) is not None and seen.type != _TRUTH:
+        agg, path = seen, path[1:]
+    return _extract(self, agg, path, name) if path else agg
+
+
+def item(value: Any, place: int) -> Any:
+    """Return what was put at a place of a tuple, if that can be seen; None otherwise."""
+    while isinstance(value, ir.instructions.InsertValue):
+        if value.indices[0] == place:
+            return value.operands[1] if len(value.indices) == 1 else None
+        value = value.operands[0]
+    return None
+
+
+class _Context:
+    """Takes the place of ``new_error_context``: an error is told where it happened, and nothing is done otherwise."""
+
+    def __init__(self, *said: Any, **parts: Any) -> None:
+        self._said, self._parts = said, parts
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        if error is not None:
+            with new_error_context(*self._said, **self._parts):
+                raise error
+
+
 def _is_finite(builder: Any, val: Any) -> Any:
     """Take the place of Numba's ``is_finite``: whether the absolute value is below infinity."""
     size = builder.call(builder.module.declare_intrinsic("llvm.fabs", [val.type]), [val])
@@ -174,6 +212,10 @@ def remembering() -> Iterator[None]:
         (NRTContext, "get_meminfos", _counts),
         (BaseContext, "refresh", _refreshed),
         (TargetConfig, "values", _options),
+        (ir.IRBuilder, "extract_value", _extracted),
+        (base, "_has_loc", _has_place),
+        (lowering, "new_error_context", _Context),
+        (typeinfer, "new_error_context", _Context),
         (of_python, "is_finite", _is_finite),
         (of_numpy, "is_finite", _is_finite),
         (lock, "_cblist", lock._cblist if event._registered.get(_LLVM_CALLS) else []),
