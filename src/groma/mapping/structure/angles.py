@@ -63,7 +63,7 @@ class AngleGates:
     most: float = gate(8.7e-3, "rad", "that angles deviate which are meant to be right", "convention: half a degree")
     held: float = gate(1e-4, "rad", "by which right angles are held at least", "cost: conditioning of an adjustment")
     tried: int = gate(100, "deviations", "from the least to the most", "cost: each a twentieth larger than the last")
-    known: float = gate(0.01, "rad", "deviation of an angle that still says something", "chosen on synthetic rooms")
+    known: float = gate(0.01, "rad", "deviation of an angle that tells of others", "chosen on synthetic rooms")
 
 
 GATES = AngleGates()
@@ -184,8 +184,10 @@ def right_angles(
     if len(found) == 0:
         return Angles(found, right, np.zeros(0), np.zeros(0))
     live = np.column_stack([np.ones(len(found)), (~right).astype(np.float64)])
-    certain = (variance * live).max(axis=1) < gates.known**2
-    telling = certain if implied is None else certain & ~implied[found[:, 0], found[:, 1]]
+    uncertain = np.sqrt((variance * live).max(axis=1))
+    telling = uncertain < gates.known
+    if implied is not None:
+        telling &= ~implied[found[:, 0], found[:, 1]]
     exact = variance + DIRECTIONS.parallel**2 * live
     family = 2 * kind[found].sum(axis=1) + right
     even = np.where(right, 0.5 / gates.layer, 1.0 / (np.pi * gates.layer**2))
@@ -204,7 +206,9 @@ def right_angles(
         _worth(found[telling], family[telling], len(vectors)),
     )
     squared = (offset**2 / (exact + (told.deviation[family, None] * live) ** 2)).sum(axis=1)
-    passed = certain & (squared < np.where(right, *(chi_square_gate(1.0 - level, freedom) for freedom in (1, 2))))
+    # What noise may take out of the layer is not among what is tried.
+    passed = NORMAL.far * uncertain < gates.layer
+    passed &= squared < np.where(right, *(chi_square_gate(1.0 - level, freedom) for freedom in (1, 2)))
     order = np.flatnonzero(passed)[np.argsort(-told.probability[passed], kind="stable")]
     wrong = np.cumsum(1.0 - told.probability[order]) / np.arange(1, len(order) + 1)
     kept = order[wrong <= NORMAL.significance]

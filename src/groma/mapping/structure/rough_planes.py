@@ -35,6 +35,8 @@ from groma.mapping.structure.relations import Landmarks, Pairs, RelationGates, o
 
 #: Rounds in which planes are fitted to members and members told again (cost: time; the second moves planes little).
 _ROUNDS = 2
+#: Unknowns of a plane (derived from geometry).
+_UNKNOWNS = 3
 
 #: What counts as beside a plane.
 _RELATIONS = RelationGates()
@@ -68,9 +70,10 @@ def on_fitted_planes(
     fitted = partial(_fitted_in_turn, marks, level=level, least=least, min_support=min_support, known={})
     found = fitted(planes)
     into, joined = _joined(marks, *found, fitted, level)
-    if joined is found[0]:
-        return found
-    planes, points, lines = fitted(joined)
+    planes, points, lines = found if joined is found[0] else fitted(joined)
+    # A plane was found in features of which others may have taken some: they say nothing about where it is.
+    enough = np.flatnonzero(_num_members(points, lines, len(planes)) > _UNKNOWNS)
+    planes = _fitted(marks, planes, points, lines, deviations(points, lines, len(planes)), enough)
     return _with_shared_deviations(marks, planes, points, lines, found[1:], into), points, lines
 
 
