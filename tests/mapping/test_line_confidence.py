@@ -5,12 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.special import erf
+from scipy.special import erf, erfinv
 
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.io.archive import read_archive, write_archive
 from groma.mapping.lines.confidence import (
     GATES,
+    NO_TEXTURE,
+    TOGETHER,
     WEIGHTS,
     edge_probability,
     line_accuracy,
@@ -74,8 +76,8 @@ def test_evidence_by_hand():
     found = columns(scene_of(ends, [[-1.0, 0, 0], [1, 0, 0]], noise=0.0))
     np.testing.assert_allclose(np.exp(found["spread"]), np.sin(np.arctan(0.1)), rtol=1e-9)
     # Nothing is known of their contrast: it is the usual one.
-    usual = GATES.usual_contrast / GATES.texture
-    np.testing.assert_allclose(np.exp(found["prominence"]), usual * np.array([100.0, 1050.0]) / 575.0, rtol=1e-9)
+    usual = GATES.usual_contrast * np.array([100.0, 1050.0]) / 575.0
+    np.testing.assert_allclose(np.exp(found["prominence"]), usual, rtol=1e-9)
     # Both are seen by all images; the second leaves the frame, so that no image is expected to show it.
     np.testing.assert_allclose(np.exp(found["support"]), [5.0, 5.0])
     fewer = scene_of(ends, [[-1.0, 0, 0], [1, 0, 0], [0, 0, 1]], noise=0.0)
@@ -155,10 +157,12 @@ def test_lines_that_do_not_stand_out_are_texture(scene):
     np.testing.assert_allclose(line_evidence(part), line_evidence(whole), rtol=1e-12)
 
 
-def test_an_edge_and_texture_are_equally_likely_at_the_gate():
+def test_an_edge_and_texture_are_equally_likely_at_the_prominence_of_the_weights():
     weights = np.array(list(WEIGHTS.values()))
     rows = np.zeros((3, len(WEIGHTS)))
-    rows[:, 0], rows[:, -1] = 1.0, [0.0, 20.0, -20.0]
+    rows[:, [TOGETHER.start, NO_TEXTURE.start]] = 1.0
+    limit = -WEIGHTS["texture"] / WEIGHTS["prominence"]
+    rows[:, -1] = limit + np.array([0.0, 20.0, -20.0])
     at, far, below = edge_probability(rows, weights)
     assert at == pytest.approx(0.5 * far) and below < 1e-12
 
@@ -204,7 +208,7 @@ def test_half_of_a_line_decides_though_one_end_is_uncertain():
     assert expected < 0.8 * line_accuracy(scene, gates=gates)[0]
 
 
-def test_planes_that_meet_in_a_line_tell_where_it_is():
+def test_planes_of_a_line_tell_where_it_is():
     # Seen from a short base its depth is uncertain; the planes x = 0 and z = 10 meet in it.
     centers = np.column_stack([np.linspace(-0.1, 0.1, 5), np.zeros((5, 2))])
     gates, scene = replace(GATES, edge_px=1e9), scene_of([[[0.0, -1, 10], [0, 1, 10]]], centers)
@@ -219,11 +223,16 @@ def test_planes_that_meet_in_a_line_tell_where_it_is():
     nearly = [0.001, 0, np.sqrt(1 - 1e-6), -10]
     tolerance, flat = gates.tolerance * usual_distance(scene), 0.5 * usual_distance(scene) / FOCAL
     assert alone < 0.3
-    assert accuracy(depth) == accuracy(depth, nearly) == pytest.approx(alone)
-    assert accuracy(side, depth) == pytest.approx(erf(tolerance / (np.sqrt(2.0) * flat)), rel=1e-3)
-    assert accuracy(side, depth, line_on_plane_sigma=[0.01, 0.02]) == pytest.approx(
-        erf(tolerance / (np.sqrt(2.0) * 0.02))
-    )
+    # A plane that all images see edge-on tells no depth; one across their view does, alone or with another of its kind.
+    assert accuracy(side) == pytest.approx(alone, rel=1e-3)
+    rough = erf(tolerance / (np.sqrt(2.0) * 0.02))
+    assert accuracy(depth, line_on_plane_sigma=[0.02]) == pytest.approx(rough, rel=0.02)
+    twice = erf(tolerance / 0.02)
+    assert accuracy(depth, nearly, line_on_plane_sigma=[0.02, 0.02]) == pytest.approx(twice, rel=0.02)
+    assert accuracy(side, depth) == pytest.approx(erf(tolerance / (np.sqrt(2.0) * flat)), rel=0.02)
+    # Segments and a plane that know as much as each other: half of the variance.
+    equal = tolerance / (np.sqrt(2.0) * erfinv(alone))
+    assert accuracy(depth, line_on_plane_sigma=[equal]) == pytest.approx(erf(np.sqrt(2.0) * erfinv(alone)), rel=0.02)
 
 
 def test_contours_of_a_pillar_are_no_edges():

@@ -4,7 +4,7 @@ r"""How probable it is that a line is right, from what its observations say.
 A line is called right where an edge of the object runs along it, at least along half of it, within 2.5 thousandths of
 the usual distance of lines from their cameras. Four things must be true of it:
 
-.. math:: p = \frac{1}{1 + \exp(-w_0 - \sum_k w_k x_k)}\; \frac{1}{1 + \exp(-w_t x_t)}\;
+.. math:: p = \frac{1}{1 + \exp(-w_0 - \sum_k w_k x_k)}\; \frac{1}{1 + \exp(-w_s - w_t x_t)}\;
           \operatorname{erf}\frac{\tau}{\sqrt 2\, u}\; \operatorname{erf}\frac{1}{\sqrt 2\, r}.
 
 The first factor, that its segments belong together, is a logistic model of five quantities (:func:`line_evidence`).
@@ -13,11 +13,10 @@ images that show the body beside it do not show it where others do. The second, 
 prominence alone: contrast (:mod:`groma.features.contrast`) times relative length, since texture has stripes of the same
 contrast beside it, and its stripes are short. Where views agree on texture, as they do on stripes of a wall, only this
 factor tells. The third is the probability of a normal error within :math:`\tau = 0.0025`, where u is the standard
-deviation across the line that half of its places do not exceed, over the usual distance: by its segments, or by the
-planes that meet in it where these tell more, as tread and riser do of the edge of a step that all images see from one
-height. The fourth is the share of normal residuals of r pixels root mean square within the width of an edge, a pixel:
-chords of curves fit no single line, and where segments of a curve are bowed their standard deviations, and with them r,
-say so.
+deviation across the line that half of its places do not exceed, over the usual distance. Segments and the planes that
+the line lies on tell it together: of an edge that all images see from one height, planes know the depth. The fourth is
+the share of normal residuals of r pixels root mean square within the width of an edge, a pixel: chords of curves fit no
+single line, and where segments of a curve are bowed their standard deviations, and with them r, say so.
 
 No quantity depends on the unit of length or on how many pixels an image has. The weights were fitted on rendered scenes
 of boxes and round bodies whose edges are known exactly, and the probabilities compared with those of other scenes
@@ -51,8 +50,8 @@ from groma.scene import Scene
 
 #: The quantities, and the weight of each as ``benchmarks/line_confidence.py`` found it.
 WEIGHTS: dict[str, float] = {
-    "constant": 3.426, "spread": 0.962, "support": 1.557, "beside": 1.216, "residual": -1.246, "drift": -2.037,
-    "prominence": 3.149,
+    "constant": 4.235, "spread": 1.032, "support": 1.689, "beside": 1.115, "residual": -1.007, "drift": -1.835,
+    "texture": -4.327, "prominence": 3.249,
 }  # fmt: skip
 
 
@@ -62,16 +61,14 @@ class ConfidenceGates:
 
     tolerance: float = gate(0.0025, "1", "error of a right line over the distance", "convention: two pixels")
     edge_px: float = gate(SEGMENTS.edge, "px", "residual of a segment of a right line", "derived from an edge's width")
-    texture: float = gate(
-        3.0, "1", "prominence of a line that is as likely an edge as texture",
-        "derived from normal gradients, which exceed two standard deviations, three times their median, in 1 of 22",
-    )  # fmt: skip
     usual_contrast: float = gate(30.0, "1", "of segments whose contrast is unknown", "chosen on the scenes of the fit")
 
 
 GATES = ConfidenceGates()
 #: Lines of a smaller probability are no part of a map: they are more likely wrong than right.
 DEFAULT_CONFIDENCE = 0.5
+#: Quantities of the two logistic models; the first of each is 1.
+TOGETHER, NO_TEXTURE = slice(0, 6), slice(6, 8)
 #: Smallest misfit and spread, below which they say nothing more.
 _MIN_MISFIT, _MIN_SPREAD = 0.3, 1e-4
 #: Shares of an information below which it is none: that of a line, and of the radius beside it (convention: rounding).
@@ -95,7 +92,7 @@ def line_confidence(scene: Scene, surface_px: float = SURFACE_SIGMA_PX) -> Float
 
 def edge_probability(evidence: FloatArray, weights: FloatArray) -> FloatArray:
     """Return the probability (L,) that there is an edge, from what :func:`line_evidence` returns and its weights."""
-    together, no_texture = evidence[:, :-1] @ weights[:-1], evidence[:, -1] * weights[-1]
+    together, no_texture = (evidence[:, part] @ weights[part] for part in (TOGETHER, NO_TEXTURE))
     return np.asarray(scipy.special.expit(together) * scipy.special.expit(no_texture))
 
 
@@ -107,14 +104,13 @@ def line_accuracy(
     ``noise`` is that of the lines, if it is known; surfaces deviate from planes by ``surface_px`` pixels.
     """
     noise = line_noise(scene) if noise is None else noise
-    by_segments = _deviation(noise) * np.maximum(noise.misfit, 1.0)
-    deviation = np.minimum(by_segments, _where_planes_meet(scene, surface_px)) / usual_distance(scene)
+    deviation = _deviation(scene, noise, surface_px) / usual_distance(scene)
     within = scipy.special.erf(gates.tolerance / (math.sqrt(2.0) * deviation))
     return within * scipy.special.erf(gates.edge_px / (math.sqrt(2.0) * _residual_px(scene, noise)))
 
 
 def line_evidence(scene: Scene, noise: LineNoise | None = None) -> FloatArray:
-    r"""Return what the probability that there is an edge is computed from, (L, 7), in the order of ``WEIGHTS``.
+    r"""Return what the probability that there is an edge is computed from, (L, 8), in the order of ``WEIGHTS``.
 
     ``noise`` is that of the lines, if it is known.
 
@@ -127,8 +123,9 @@ def line_evidence(scene: Scene, noise: LineNoise | None = None) -> FloatArray:
     ``residual``    logarithm of the root mean square of its residuals, pixels
     ``drift``       logarithm of 1 + t, where t is how many standard deviations the radius is off zero of the cylinder
                     whose outlines explain its segments best
+    ``texture``     1
     ``prominence``  mean over its segments of the logarithm of their contrast, plus that of its longest observed
-                    segment over the median of those of all lines, less that of ``ConfidenceGates.texture``
+                    segment over the median of those of all lines
     ==============  ===============================================================================================
     """
     seen, noise = scene.line_observations, line_noise(scene) if noise is None else noise
@@ -144,7 +141,8 @@ def line_evidence(scene: Scene, noise: LineNoise | None = None) -> FloatArray:
             np.log((images + 0.5) / (absent_beside + 0.5)),
             np.log(_residual_px(scene, noise)),
             np.log1p(np.abs(_drift(scene, noise))),
-            _log_contrast(scene) + np.log(longest / (np.median(longest) if len(longest) else 1.0) / GATES.texture),
+            np.ones(scene.num_lines),
+            _log_contrast(scene) + np.log(longest / (np.median(longest) if len(longest) else 1.0)),
         ]
     )
 
@@ -167,22 +165,18 @@ def _residual_px(scene: Scene, noise: LineNoise) -> FloatArray:
     return np.maximum(noise.misfit, _MIN_MISFIT) * usual * noise.sigma_px
 
 
-def _where_planes_meet(scene: Scene, surface_px: float) -> FloatArray:
-    """(L,) standard deviation across each line by the planes it lies on alone; very large on one plane or none."""
-    line, plane = scene.relations.line_on_plane.T
-    own, normal = scene.relations.sigma("line_on_plane"), scene.planes.hesse[plane, :3]
-    sigma = np.where(own > 0.0, own, surface_px * lengths_per_pixel(scene, "line")[line])
-    information = np.zeros((scene.num_lines, 3, 3))
-    np.add.at(information, line, normal[:, :, None] * normal[:, None, :] / sigma[:, None, None] ** 2)
-    # Normals are across the line, so the smallest eigenvalue belongs to its direction.
-    return 1.0 / np.sqrt(np.maximum(np.linalg.eigvalsh(information)[:, 1], 1e-300))
-
-
-def _deviation(noise: LineNoise) -> FloatArray:
+def _deviation(scene: Scene, noise: LineNoise, surface_px: float) -> FloatArray:
     """(L,) standard deviation across each line, in its worst direction, that half of its places do not exceed."""
-    rows = np.repeat(np.arange(len(noise.covariance)), len(_PLACES))
-    share = np.tile(_PLACES, len(noise.covariance))
-    worst = np.linalg.eigvalsh(noise.at(share, share, rows))[:, -1].reshape(-1, len(_PLACES))
+    line, plane = scene.relations.line_on_plane.T
+    own = scene.relations.sigma("line_on_plane")
+    sigma = np.where(own > 0.0, own, surface_px * lengths_per_pixel(scene, "line")[line])
+    normal = np.einsum("nai,ni->na", noise.across[line], scene.planes.hesse[plane, :3]) / sigma[:, None]
+    by_planes = np.zeros((scene.num_lines, 2, 2))
+    np.add.at(by_planes, line, normal[:, :, None] * normal[:, None, :])
+    rows, share = np.repeat(np.arange(scene.num_lines), len(_PLACES)), np.tile(_PLACES, scene.num_lines)
+    by_segments = noise.by_misfit().at(share, share, rows)
+    both = np.linalg.solve(np.eye(2) + by_segments @ by_planes[rows], by_segments)
+    worst = np.linalg.eigvalsh(both)[:, -1].reshape(-1, len(_PLACES))
     return np.sqrt(np.maximum(np.median(worst, axis=1), 1e-300))
 
 
