@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Poses of all frames once the keyframes have been adjusted."""
 
+from types import SimpleNamespace
+
 import _room
 import numpy as np
 
@@ -10,6 +12,7 @@ from groma.tracking.frame.features import Features
 from groma.tracking.frame.measurements import Measurements
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.outcome import History
+from groma.tracking.result import about_rest
 
 NO_FEATURES = Features(
     np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 32), np.uint8), np.zeros(0), np.zeros(0, int)
@@ -61,3 +64,10 @@ def test_keyframes_of_a_track_are_where_the_map_has_them():
     rows = np.searchsorted(result.trajectory.timestamps, result.keyframes)
     expected = se3.inverse(result.scene.cam_from_world)
     np.testing.assert_allclose(result.trajectory.world_from_cam[rows], expected, atol=1e-9)
+
+
+def test_a_map_of_one_keyframe_says_why():
+    alone = SimpleNamespace(num_images=1)
+    assert "hardly moved" in about_rest(alone, 10)[0]
+    assert "no other frame has a pose" in about_rest(alone, 1)[0]
+    assert about_rest(SimpleNamespace(num_images=2), 1) == []

@@ -50,8 +50,9 @@ def map_to_scene(track_map: TrackMap, camera: TrackCamera, relations: bool = Tru
     return map_scene(camera, track_map, poses, names, points, lines, planes, relations=tied)
 
 
-def about_rest(scene: Scene) -> list[str]:
-    """Say so where a map has one keyframe, whose measurements nothing confirms."""
+def about_rest(scene: Scene, num_poses: int) -> list[str]:
+    """Say so where a map has one keyframe, whose measurements nothing confirms, of so many frames with a pose."""
     if scene.num_images != 1:
         return []
-    return ["The map has one keyframe, because the camera hardly moved: landmarks are where that view alone has them."]
+    why = "because the camera hardly moved" if num_poses > 1 else "as no other frame has a pose"
+    return [f"The map has one keyframe, {why}: landmarks are where that view alone has them."]

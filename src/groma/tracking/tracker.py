@@ -369,8 +369,7 @@ class Tracker:
         roots = sorted({root for root, _ in where if mapper.maps[root].keyframes}) or [0]
         count = {root: sum(entry.submap == root for entry in history.entries) for root in roots}
         main = max(roots, key=lambda root: count[root])
-        if self._saved is not None and count[0]:  # the world of the saved map comes first
-            main = 0
+        main = 0 if self._saved is not None and count[0] else main  # the world of the saved map comes first
         others = [root for root in roots if root != main and (count[root] or self._saved is None)]
         for root in others:
             ending.adjust(root)
@@ -381,7 +380,8 @@ class Tracker:
         warnings = [*self._checks.warnings, *ending.warnings]
         if not history.entries:
             warnings.append("No map was made: no frame could be used, or the camera did not move enough to start.")
-        warnings += about_rest(whole.scene) + about_submaps(self._breaks, where, [count[root] for root in others])
+        warnings += about_rest(whole.scene, count[main])
+        warnings += about_submaps(self._breaks, where, [count[root] for root in others])
         return TrackResult(whole.trajectory, whole.scene, whole.keyframes, statistics, tuple(warnings), tuple(submaps))
 
     def statistics(self) -> dict:

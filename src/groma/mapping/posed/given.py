@@ -72,7 +72,7 @@ def scene_at_poses(images: Path, poses: Path, options: PointModelOptions) -> Giv
 def in_pixels_of(scene: Scene, images: Path) -> tuple[Scene, tuple[str, ...]]:
     """Return a scene in the pixels of photographs that were made smaller or larger than its cameras, and say so.
 
-    A camera is scaled where all its photographs have one size of its proportions, as far as whole pixels allow, and both
+    A camera is scaled where all its photographs have one size of its proportions, as far as pixels allow, and both
     sides differ. Anything else stays as it is, for :func:`groma.mapping.photographs.check_images` to refuse.
     """
     of_image = np.array([size_of_image(images, name) for name in scene.images.names], float).reshape(-1, 2)

@@ -28,6 +28,7 @@ class StartGates:
 
     min_known: int = gate(15, "points", "points with depth (a line counts 2, a plane 5)", SEQUENCES)
     min_displacement: float = gate(0.02, "share", "median shift, of the image's width", "chosen on rendered rooms")
+    most_gone: float = gate(0.5, "share", "of the points gone, with which no shift is waited for", "convention: half")
     min_points: int = gate(60, "points", "points followed and placed", "chosen on rendered rooms")
     min_inliers: float = gate(0.6, "share", "share of the points in front of both cameras", "chosen on rendered rooms")
     depth_sigma: float = gate(0.15, "share", "median deviation of the first depths", "convention: depths are known")

@@ -57,7 +57,9 @@ class Initialiser:
         if good.sum() < self._gates.min_points:
             return self._restart(data)
         away = float(np.median(np.linalg.norm(self._views[-1] - self._views[0], axis=1)))
-        if away < self._gates.min_displacement * self._camera.width:
+        assert self._first is not None
+        gone = 1.0 - len(pixel[good]) / len(self._first.features.pixel)  # of one who drives ahead, those that move far
+        if away < self._gates.min_displacement * self._camera.width and gone < self._gates.most_gone:
             return None
         return self._judge(data) if self._candidates else self._propose()
 
