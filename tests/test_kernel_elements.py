@@ -8,7 +8,11 @@ import sys
 import numba
 import numpy as np
 import pytest
+from numba.core import compiler
+from numba.core.codegen import CPUCodeLibrary
 
+from groma._kernels.elements import _assigned_before_use
+from groma._kernels.inner import Pipeline
 from groma._numba import loop
 
 pytestmark = [pytest.mark.kernels, pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled")]
@@ -253,3 +257,78 @@ def test_squares_are_products(x):
         n, single = np.int64(-7), np.float32(x)
         expected = (x * x, 49, (x + n) * (x + n), single * single, x * x * x, 4.0, x * x)
     np.testing.assert_array_equal(_squares(x, n), expected)
+
+
+def _with_branches(values, count):
+    first = values[0]
+    total = 0.0
+    for i in range(count):
+        twice = 2.0 * first
+        if i > 1:
+            late = twice + i
+            total = total + late
+    if count > 2:
+        total = total + late
+    return total
+
+
+def test_variables_that_stay_in_registers_are_assigned_before_each_use():
+    found = _assigned_before_use(compiler.run_frontend(_with_branches).blocks)
+    assert {"values", "count", "first", "twice"} <= found
+    assert found.isdisjoint(("total", "late"))  # assigned twice, and in a branch that need not be taken
+
+
+def test_variables_of_branches_and_loops_have_the_values_of_python(monkeypatch):
+    made, add = [], CPUCodeLibrary.add_ir_module
+    monkeypatch.setattr(CPUCodeLibrary, "add_ir_module", lambda self, one: made.append(str(one)) or add(self, one))
+    compiled = numba.njit(pipeline_class=Pipeline)(_with_branches)  # not kept on disk
+    for count in range(6):
+        assert compiled(np.array([1.5, 7.0]), count) == _with_branches(np.array([1.5, 7.0]), count)
+    rooms = {line.split("=")[0].strip(' %"') for line in made[0].splitlines() if "= alloca" in line}
+    assert any(room.startswith("total") for room in rooms)
+    assert rooms.isdisjoint(("count", "first", "twice"))
+
+
+@loop
+def _rows_one_after_another(array, count):
+    chosen = array[0]
+    total = 0.0
+    for i in range(count):
+        row = array[i]
+        for j in range(len(row)):
+            total += chosen[j] * row[j]
+        if total > 20.0:
+            chosen = row
+    return total, chosen
+
+
+def test_parts_that_are_replaced_in_a_loop_are_counted():
+    array = np.arange(12.0).reshape(4, 3)
+    before = sys.getrefcount(array)
+    for count in range(5):
+        (total, chosen), (expected, part) = (
+            run(array, count) for run in (_rows_one_after_another, _rows_one_after_another.py_func)
+        )
+        assert total == expected
+        np.testing.assert_array_equal(chosen, part)
+        del chosen, part
+    assert sys.getrefcount(array) == before
+
+
+@loop
+def _computed(a, b):
+    return a + b, a - b, a * b, a / b, a < b, a <= b, a > b, a >= b, a == b, a != b
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32, np.int64, np.int32, bool])
+def test_numbers_are_computed_and_compared_as_numpy_does(kind):
+    numbers = [0, 1] if kind is bool else [-3, 0, 1]
+    numbers += [-0.0, np.inf, -np.inf, np.nan] if issubclass(kind, np.floating) else []
+    wide = {np.float64: float, np.float32: np.float32}.get(kind, int)
+    for first in numbers:
+        for second in numbers:
+            a, b = kind(first), kind(second)
+            x, y = wide(a), wide(b)
+            with np.errstate(all="ignore"):
+                expected = (x + y, x - y, x * y, np.divide(x, y), x < y, x <= y, x > y, x >= y, x == y, x != y)
+            np.testing.assert_array_equal(_computed(a, b), expected)

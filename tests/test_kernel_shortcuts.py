@@ -10,6 +10,7 @@ import llvmlite.binding as llvm
 import numba
 import numpy as np
 import pytest
+from llvmlite import ir
 from numba import extending
 from numba.core import compiler, event, types
 from numba.core.registry import cpu_target
@@ -173,3 +174,30 @@ def test_what_is_registered_later_is_found():
         later = extending.intrinsic(typed)
         assert numba.njit(lambda x: later(x) + 1.0)(2.0) == 3.0
     assert calls
+
+
+def test_an_error_is_told_where_it_happened():
+    @loop
+    def wrong(values):
+        return values + "text"
+
+    with pytest.raises(numba.TypingError, match=r"(?s)No implementation of function.*During: typing of intrinsic-call"):
+        wrong(np.zeros(3))
+
+
+def test_what_was_put_into_a_tuple_is_not_taken_out_again():
+    function = ir.Function(ir.Module(), ir.FunctionType(ir.VoidType(), [ir.DoubleType(), ir.IntType(1)]), "f")
+    builder = ir.IRBuilder(function.append_basic_block())
+    pair = ir.LiteralStructType([ir.DoubleType(), ir.IntType(1)])
+    outer = ir.LiteralStructType([pair, ir.DoubleType()])
+    with shortcuts.remembering():
+        inner = ir.Constant(pair, ir.Undefined)
+        for place, value in enumerate(function.args):
+            inner = builder.insert_value(inner, value, place)
+        whole = builder.insert_value(ir.Constant(outer, ir.Undefined), inner, 0)
+        assert builder.extract_value(whole, (0, 0)) is function.args[0]
+        assert builder.extract_value(inner, 0) is function.args[0]
+        assert builder.extract_value(inner, 1).opname == "extractvalue"  # whether a loop goes on
+        assert builder.extract_value(whole, 1).opname == "extractvalue"  # never put there
+        deep = builder.insert_value(whole, function.args[0], (0, 0))
+        assert builder.extract_value(deep, 0).opname == "extractvalue"  # put there in pieces

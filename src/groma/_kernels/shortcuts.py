@@ -6,7 +6,8 @@ is remembered by the types of the operands, as are numbers of arrays, attributes
 Python such as ``max``: a tenth of the time that Python takes of a compilation. Numba asks again when it makes code,
 and tells whoever listens of every call of LLVM, though nobody does: another tenth. To count a reference to an array it
 takes the whole description apart: a fifth of the instructions for LLVM, without effect. Where it has no code for
-something it goes through all registries of code anew, some seven times in each function.
+something it goes through all registries of code anew, some seven times in each function. It prepares for an error in
+every statement, and reads the arguments of each rule anew.
 
 One answer is not Numba's: whether a number is finite. Numba tests ``x - x``, which is zero, and not NaN, for whatever
 sum ``x`` is, as soon as operations may be regrouped.
@@ -165,12 +166,12 @@ def _extracted(self: Any, agg: Any, idx: Any, name: str = "") -> Any:
     Whether a loop goes on is taken out: LLVM would simplify its branches sooner, to loops of another shape.
     """
     path = list(idx) if isinstance(idx, tuple | list) else [idx]
-    while path and (seen := item(agg, path[0])) is not None and seen.type != _TRUTH:
+    while path and (seen := _item(agg, path[0])) is not None and seen.type != _TRUTH:
         agg, path = seen, path[1:]
     return _extract(self, agg, path, name) if path else agg
 
 
-def item(value: Any, place: int) -> Any:
+def _item(value: Any, place: int) -> Any:
     """Return what was put at a place of a tuple, if that can be seen; None otherwise."""
     while isinstance(value, ir.instructions.InsertValue):
         if value.indices[0] == place:
