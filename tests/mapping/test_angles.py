@@ -301,9 +301,9 @@ def treads(turned, both):
     return angles_between(plane_set, directions, (on, along), None, 0.99)
 
 
-@pytest.mark.parametrize(("turned", "both", "parallel"), [(0.06, True, True), (0.06, False, False), (0.1, True, False)])
-def test_lines_along_two_directions_tell_a_normal(turned, both, parallel):
-    """A narrow plane is parallel to another one if two directions in it say so, and do not contradict the plane."""
+@pytest.mark.parametrize(("turned", "both", "sure"), [(0.06, True, True), (0.06, False, False), (0.1, True, False)])
+def test_lines_along_two_directions_tell_a_normal(turned, both, sure):
+    """A narrow plane is surely parallel to another one if two directions in it say so, and do not contradict it."""
     found = treads(turned, both)
-    assert found["parallel_planes"].pairs.tolist() == ([[0, 1]] if parallel else [])
-    assert ([1, 0] in found["plane_along_direction"].pairs.tolist()) == parallel
+    assert (found["parallel_planes"].probability.max(initial=0.0) > 0.99) == sure
+    assert ([1, 0] in found["plane_along_direction"].pairs.tolist()) == sure

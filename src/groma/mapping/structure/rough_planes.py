@@ -4,7 +4,8 @@
 The search for planes finds where features lie on a plane within their noise: of a rough wall some panel, or a plane
 that cuts through several. How far members of the wall deviate is estimated afterwards, around that plane. A plane
 fitted to the members with this deviation in their noise is the one of most likelihood, and tells again what its members
-are.
+are. In the end every plane is fitted to its members: of what it was found in, other planes may have taken a part, and
+the normal of a narrow one then is off by many of the deviations that it had.
 
 Of a rough wall several such planes may have been found. Planes beside one with more members, within the layer in which
 members are told from clutter, are tried as pieces of one wall where members of one of them deviate, or where three are
@@ -47,7 +48,7 @@ _Told = tuple[PlaneSet, Pairs, Pairs]
 def on_fitted_planes(
     marks: Landmarks, planes: PlaneSet, level: float, least: tuple[float, float], min_support: int
 ) -> tuple[PlaneSet, Pairs, Pairs]:
-    """Return the planes, those whose members deviate fitted to them, and the points and lines on planes.
+    """Return the planes fitted to what lies on them, with how far it deviates, and the points and lines on planes.
 
     Parameters
     ----------
@@ -58,7 +59,8 @@ def on_fitted_planes(
     level, least
         As :func:`~groma.mapping.structure.relations.on_planes` has them.
     min_support : int
-        Least number of members of a plane that is fitted, a segment counts as two; planes with fewer stay.
+        Least number of members that tell how far they deviate, a segment counts as two: with fewer the members of a
+        plane stay.
 
     Returns
     -------
