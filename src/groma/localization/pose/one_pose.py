@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -79,12 +80,26 @@ class OnePose:
         begin, place = {}, 0
         for slot, size in wanted.items():
             begin[slot], place = place, place + size
-        now = {"pose": self.chart.ambient(self.pose[None]), "intrinsics": self.params[None]}
-        factor, count = part.factor, len(part.row)
-        record = np.zeros((count, factor.residual_size, place + 1))
-        inputs = factor.prepare(tuple(now.get(slot, own) for slot, own in zip(part.slots, part.held, strict=True)))
-        factor.linearize(inputs, 0, count, tuple(begin.get(slot, -1) for slot in part.slots), record)
+        record = np.zeros((len(part.row), part.factor.residual_size, place + 1))
+        self._write(part, begin, record)
         return record
+
+    def write(self, record: FloatArray, lens: bool) -> None:
+        """Write derivatives by the pose, by the parameters of the camera if ``lens``, and residuals of all parts."""
+        begin, place = {"pose": 0, "intrinsics": 6 if lens else -1}, 0
+        for part in self.parts:
+            self._write(part, begin, record[place : place + len(part.row)])
+            place += len(part.row)
+
+    def _write(self, part: Part, begin: Mapping[str, int], record: FloatArray) -> None:
+        inputs = part.factor.prepare(
+            tuple(self._now.get(slot, own) for slot, own in zip(part.slots, part.held, strict=True))
+        )
+        part.factor.linearize(inputs, 0, len(record), tuple(begin.get(slot, -1) for slot in part.slots), record)
+
+    @cached_property
+    def _now(self) -> dict[str, FloatArray]:
+        return {"pose": self.chart.ambient(self.pose[None]), "intrinsics": self.params[None]}
 
     def whitened(self, part: Part, wanted: Mapping[str, int]) -> FloatArray:
         """:meth:`records` by the noise of the image alone."""

@@ -82,13 +82,8 @@ def fit_pose(
         What is estimated of the camera, too; else it is held.
     """
     kept: dict[str, BoolArray] = dict(zip(("points", "lines"), near, strict=True))
-    rows = [part.of_rows(kept) for part in start.parts]
-    count = sum(int(row.sum()) for row in rows)
-
-    def at(one: OnePose) -> _Sum:
-        return _sum(one, weights, rows, loss, lens)
-
-    here, damping, fell = at(start), NielsenDamping(_DAMPING), 0.0
+    at = _Sums(start, weights, np.concatenate([np.zeros(0, bool), *(part.of_rows(kept) for part in start.parts)]), loss, lens)
+    here, damping, fell, count = at(start), NielsenDamping(_DAMPING), 0.0, int(at.near.sum())
     if not math.isfinite(here.cost) or here.hidden == count:
         return start
     share = here.cost / max(1, count)
@@ -123,7 +118,7 @@ def fit_pose(
 
 def full_step(one: OnePose, weights: Sequence[FloatArray], loss: Loss, lens: FreeLens) -> FloatArray | None:
     """Return the undamped step (6 + k,) of a pose and a lens by all matches; None where they do not determine it."""
-    here = _sum(one, weights, [np.ones(len(part.row), bool) for part in one.parts], loss, lens)
+    here = _Sums(one, weights, np.ones(sum(map(len, weights)), bool), loss, lens)(one)
     H = here.total[:-1, :-1]
     return _step(H, here.total[:-1, -1], np.diag(H), 0.0)
 
@@ -138,22 +133,28 @@ class _Sum:
     total: FloatArray
 
 
-def _sum(
-    one: OnePose, weights: Sequence[FloatArray], near: Sequence[BoolArray], loss: Loss, lens: FreeLens | None
-) -> _Sum:
-    cost, hidden, total = 0.0, 0, np.zeros(())
-    wanted = {"pose": 6} if lens is None else {"pose": 6, "intrinsics": len(one.params)}
-    for part, weight, own in zip(one.parts, weights, near, strict=True):
-        record = one.records(part, wanted)
-        more, blind = _weigh(record, weight, own, loss.tag, loss.parameters)
-        rows = record.reshape(-1, record.shape[2])
-        if lens is not None:
-            rows = np.column_stack([rows[:, :6], rows[:, 6:-1] @ lens.directions(one.params), rows[:, -1]])
-        cost, hidden, total = cost + more, hidden + blind, total + rows.T @ rows
-    if lens is not None and len(near):
-        prior = lens.prior(one.params)
-        cost, total = cost + 0.5 * float(prior[-1, -1]), total + prior
-    return _Sum(one, cost, hidden, total)
+class _Sums:
+    """Sums over the matches that are near, at one pose after the other; all are written to one array."""
+
+    def __init__(
+        self, one: OnePose, weights: Sequence[FloatArray], near: BoolArray, loss: Loss, lens: FreeLens | None
+    ) -> None:
+        self.near, self._lens, self._loss = near, lens, (loss.tag, loss.parameters)
+        self._weight = np.concatenate([np.zeros((0, 2, 2)), *weights])
+        self._record = np.zeros((len(near), 2, 7 + (0 if lens is None else len(one.params))))
+
+    def __call__(self, one: OnePose) -> _Sum:
+        one.write(self._record, self._lens is not None)
+        cost, hidden = _weigh(self._record, self._weight, self.near, *self._loss)
+        rows = self._record.reshape(-1, self._record.shape[2])
+        total = rows.T @ rows
+        if self._lens is not None:
+            directions = self._lens.directions(one.params)
+            moved = np.zeros((len(total), 7 + directions.shape[1]))
+            moved[:6, :6], moved[6:-1, 6:-1], moved[-1, -1] = np.eye(6), directions, 1.0
+            prior = self._lens.prior(one.params)
+            cost, total = cost + 0.5 * float(prior[-1, -1]), moved.T @ total @ moved + prior
+        return _Sum(one, cost, hidden, total)
 
 
 def _step(H: FloatArray, g: FloatArray, diagonal: FloatArray, damping: float) -> FloatArray | None:

@@ -11,6 +11,7 @@ from groma._typing import FloatArray
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.one_image import one_image_problem
+from groma.geometry import line3
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.one_pose import OnePose
@@ -23,11 +24,12 @@ _ASSEMBLY = AssemblyOptions(
 
 def problem_of(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_lens: bool = False) -> OnePose:
     """The problem of one pose, with the noise of the image alone."""
-    lines = Lines.through(matches.segments3d)
     if camera.kind.has_pinhole_parameters or not matches.num_lines:
+        lines = line3.from_points(*matches.segments3d.swapaxes(0, 1))
+        lines /= np.linalg.norm(lines[:, 3:], axis=1, keepdims=True)
         problem = one_image_problem(
             (camera.kind, camera.params), pose, (matches.points2d, matches.points3d, matches.point_sigma),
-            (matches.segments2d.reshape(-1, 4), lines.plucker, matches.segment_sigma),
+            (matches.segments2d.reshape(-1, 4), lines, matches.segment_sigma),
         )  # fmt: skip
         return OnePose.of(problem, camera.params)
     image = np.zeros(matches.num_points, np.int64), np.zeros(matches.num_lines, np.int64)
@@ -37,7 +39,7 @@ def problem_of(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_l
         point_observations=PointObservations.numbered(
             image[0], np.arange(matches.num_points), matches.points2d, matches.point_sigma
         ),
-        lines=lines,
+        lines=Lines.through(matches.segments3d),
         line_observations=LineObservations(
             image[1], np.arange(matches.num_lines), matches.segments2d.reshape(-1, 4), matches.segment_sigma
         ),
