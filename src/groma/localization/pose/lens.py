@@ -23,7 +23,7 @@ from groma.localization.pose.gates import REFINEMENT, VERDICT, VerdictGates
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pose_fit import full_step
 from groma.localization.pose.pose_problem import problem_of
-from groma.localization.pose.refinement import Refined, fitted, refine, weighed
+from groma.localization.pose.refinement import Refined, fitted_at, refine, weighed
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def lens_step(
     focal, covariance = _step(refined, found, some)
     told = LensStep(float(focal[0]), float(np.sqrt(covariance[0, 0])))
     points, whole = refined.camera.kind.principal_point_indices, free_lens(refined.camera, "pinhole")
-    if not points or not _may_be_far(fitted(found.camera, some, found.pose, max_error, whole), 0.5 * gates.shift):
+    if not points or not _may_be_far(fitted_at(found.one, found.camera, some, max_error, whole), 0.5 * gates.shift):
         return told
     found = refine(refined.camera, some, refined.pose, max_error, whole, gathered=True)
     step, covariance = _step(refined, found, some)
