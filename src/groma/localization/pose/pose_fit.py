@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg.lapack import dposv
 
 from groma._numba import loop
 from groma._typing import BoolArray, FloatArray
@@ -172,9 +173,8 @@ def _step(total: FloatArray, damping: float) -> _Step | None:
     scaled = total / np.outer(scale, scale)
     scaled.flat[:: len(scaled) + 1] = 1.0 + damping
     gradient = scaled[:-1, -1]
-    try:
-        step = -np.linalg.solve(scaled[:-1, :-1], gradient)
-    except np.linalg.LinAlgError:
+    _, step, failed = dposv(scaled[:-1, :-1], -gradient)
+    if failed:
         return None
     held = damping * float(step @ step)
     promised = 0.5 * (held - float(gradient @ step))
