@@ -134,7 +134,8 @@ class CommonErrors:
             row, seen = place[int(lines)][matched], landmarks[int(lines)][matched]
             record = white[agree] @ one.records(part, "landmark", "lens")[agree][..., :-1]
             by_own, by_lens = np.split(record, [own.motion.shape[1]], axis=2)
-            _pull_views(own.begin, own.seen, own.motion, seen, np.swapaxes(pull[row], 1, 2) @ by_own, 6 * self.frames, K)
+            moved = np.swapaxes(pull[row], 1, 2) @ by_own
+            _pull_views(own.begin, own.seen, own.motion, seen, moved, 6 * self.frames, K)
             if camera is not None and self.parameters and part.has_lens:
                 first = 6 * self.frames + camera * self.parameters
                 K[first : first + by_lens.shape[2]] += _product(by_lens, pull[row])

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The problem of one pose and its matches: without a scene, whose tables and checks take longer than the factors,
-unless lens or lines ask for one.
-"""
+"""The problem of one pose and its matches: without a scene, unless lines under distortion ask for one."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +11,8 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
-from groma.factors.contract import Ref
-from groma.factors.observations.line_reprojection import LineReprojection
-from groma.factors.observations.point_reprojection import PointReprojection
+from groma.adjustment.one_image import one_image_factors
+from groma.factors.contract import Factor
 from groma.geometry import line3
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.matches import Matches
@@ -30,26 +28,13 @@ def problem_of(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_l
     """The problem of one pose, with the noise of the image alone."""
     if matches.num_lines and not camera.kind.has_pinhole_parameters:
         return OnePose(assembled(camera, matches, pose, refine_lens), pose, camera.params)
-    parts = []
-    for kind, count in (("points", matches.num_points), ("lines", matches.num_lines)):
-        if not count:
-            continue
-        row, zeros = np.arange(count), np.zeros(count, np.int64)
-        landmark, held = Ref(kind, row), {"pose": Ref("frames", zeros), "intrinsics": Ref("intrinsics", zeros)}
-        if kind == "points":
-            factor = PointReprojection(
-                point=landmark, pixels=matches.points2d, sqrt_information=1.0 / matches.point_sigma,
-                camera_model=camera.kind, **held,
-            )  # fmt: skip
-            parts.append(Part(factor, kind, row, matches.points3d))
-        else:
-            factor = LineReprojection(
-                line=landmark, segments=matches.segments2d.reshape(-1, 4), sqrt_information=1.0 / matches.segment_sigma,
-                camera_model=camera.kind, **held,
-            )  # fmt: skip
-            lines = line3.from_points(*matches.segments3d.swapaxes(0, 1))
-            parts.append(Part(factor, kind, row, lines / np.linalg.norm(lines[:, 3:], axis=1, keepdims=True)))
-    return OnePose(tuple(parts), pose, camera.params)
+    factors = one_image_factors(
+        camera.kind, (matches.points2d, matches.point_sigma),
+        (matches.segments2d.reshape(-1, 4), matches.segment_sigma),
+    )  # fmt: skip
+    lines = line3.from_points(*matches.segments3d.swapaxes(0, 1))
+    places = {"points": matches.points3d, "lines": lines / np.linalg.norm(lines[:, 3:], axis=1, keepdims=True)}
+    return OnePose(_parts(factors, places), pose, camera.params)
 
 
 def assembled(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_lens: bool) -> tuple[Part, ...]:
@@ -67,9 +52,11 @@ def assembled(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_le
         ),
     )  # fmt: skip
     problem = assemble(scene, replace(_ASSEMBLY, refine_intrinsics=refine_lens)).problem
-    parts = []
-    for factor in problem.factors:
-        landmark = factor.references()[1][1]
-        places = np.ascontiguousarray(problem.variables[landmark.group].ambient())
-        parts.append(Part(factor, landmark.group, landmark.index, places))
-    return tuple(parts)
+    places = {name: np.ascontiguousarray(group.ambient()) for name, group in problem.variables.items()}
+    return _parts(problem.factors, places)
+
+
+def _parts(factors: Sequence[Factor], places: Mapping[str, FloatArray]) -> tuple[Part, ...]:
+    landmarks = [factor.references()[1][1] for factor in factors]
+    made = zip(factors, landmarks, strict=True)
+    return tuple(Part(factor, own.group, own.index, places[own.group]) for factor, own in made)
