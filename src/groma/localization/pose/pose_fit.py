@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dposv
 
 from groma._numba import loop
 from groma._typing import BoolArray, FloatArray
@@ -23,6 +22,7 @@ from groma.localization.pose.free_lens import FreeLens
 from groma.localization.pose.one_pose import OnePose
 from groma.solver.damped_problem import Trial
 from groma.solver.levenberg_marquardt import NielsenDamping
+from groma.solver.linear.lapack import potrf, potrs
 from groma.solver.options import SolverOptions
 from groma.solver.termination import cost_converged
 
@@ -173,9 +173,10 @@ def _step(total: FloatArray, damping: float) -> _Step | None:
     scaled = total / np.outer(scale, scale)
     scaled.flat[:: len(scaled) + 1] = 1.0 + damping
     gradient = scaled[:-1, -1]
-    _, step, failed = dposv(scaled[:-1, :-1], -gradient)
+    factor, failed = potrf(scaled[:-1, :-1])
     if failed:
         return None
+    step = potrs(factor, -gradient)[0]
     held = damping * float(step @ step)
     promised = 0.5 * (held - float(gradient @ step))
     return _Step(step / scale[:-1], promised, held, float(np.abs(gradient).max()))
