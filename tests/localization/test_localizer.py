@@ -132,6 +132,21 @@ def test_lines_are_matched_where_points_do_not_decide(place, localizer, monkeypa
         assert np.array_equal(matched[1].points, matched[2].points)
 
 
+@pytest.mark.parametrize(("settled", "times"), [(True, 1), (False, 2)])
+def test_all_is_matched_only_where_it_may_change_what_is_said(place, localizer, monkeypatch, settled, times):
+    some = localizer.localize(place / "queries" / QUERIES[0]).pose
+    said = [replace(some, status="uncertain", settled=settled), replace(some, status="localized")]
+    matched = []
+
+    def pose(self, query, part, camera, options, images, found, *rest):
+        matched.append(part)
+        return said[len(matched) - 1], found
+
+    monkeypatch.setattr(Localizer, "_pose", pose)
+    assert localizer.localize(place / "queries" / QUERIES[0]).pose is said[times - 1]
+    assert len(matched) == times
+
+
 @pytest.mark.parametrize("estimated", [(True, False), (False, False)])
 def test_the_bits_do_not_depend_on_the_number_of_threads(place, tmp_path, opencv_threads, estimated):
     """Of the index and of poses; poses of the map estimated, or held, whose noise is estimated, too."""

@@ -83,10 +83,11 @@ def test_what_speaks_against_a_pose_is_told_from_too_few_matches():
         found = pose_from_matches(
             CAMERA, matches, of_map=MapQuestions(expected=lambda best, used, parts=parts: Shown(*parts))
         )
-        assert (found.status, found.contradicted) == (status, status == "uncertain")
+        assert found.status == status
+        assert found.contradicted == found.settled == (status == "uncertain")
     again = np.concatenate([world.points3d, world.points3d + np.array([1.5, 0.0, 0.0])])
     two = estimate_absolute_pose(CAMERA, np.concatenate([world.points2d, world.points2d]), again)
-    assert (two.status, two.contradicted) == ("uncertain", False)
+    assert (two.status, two.contradicted, two.settled) == ("uncertain", False, False)
 
 
 @pytest.mark.parametrize("known", [(), (0,), (1,), (0, 1)])

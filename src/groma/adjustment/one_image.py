@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The problem of one image before landmarks that are held, as :mod:`groma.adjustment.assemble` makes it of a scene.
+"""The factors of one image before landmarks that are held, as :mod:`groma.adjustment.assemble` makes them of a scene.
 
 Localising a photograph takes several of them, and the tables of a scene, with their checks, take longer than
 the factors.
@@ -14,52 +14,33 @@ from groma.cameras import CameraModel
 from groma.factors.contract import Factor, Ref
 from groma.factors.observations.line_reprojection import LineReprojection
 from groma.factors.observations.point_reprojection import PointReprojection
-from groma.geometry.charts.line_charts import LINE_CHARTS
-from groma.geometry.charts.pose_charts import POSE_CHARTS
-from groma.geometry.manifold import Euclidean
-from groma.problem.problem import Problem
-from groma.problem.variables import Variables
 
 
-def one_image_problem(
-    camera: tuple[CameraModel, FloatArray],
-    pose: FloatArray,
-    points: tuple[FloatArray, FloatArray, FloatArray],
-    lines: tuple[FloatArray, FloatArray, FloatArray],
-) -> Problem:
-    """Return the problem of one pose.
+def one_image_factors(
+    model: CameraModel, points: tuple[FloatArray, FloatArray], lines: tuple[FloatArray, FloatArray]
+) -> tuple[Factor, ...]:
+    """Return the factors of one image, first of all points, then of all lines, each of a landmark of its own.
 
     Parameters
     ----------
-    camera
-        Model and parameters (k,), which are held. Lines ask for a model without distortion.
-    pose : (7,)
-        cam_from_world.
+    model
+        Of the camera. Lines ask for one without distortion.
     points
-        Pixels (N, 2), places in the world (N, 3), standard deviations (N,) in pixels; each of a point of its own.
+        Pixels (N, 2), and their standard deviations (N,).
     lines
-        Segments (M, 4) in pixels, Plücker lines (M, 6), standard deviations (M,) of their ends in pixels.
+        Segments (M, 4), and standard deviations (M,) of their ends, pixels.
     """
-    model, params = camera
-    variables = {"frames": Variables(POSE_CHARTS["left"], pose[None])}
     factors: list[Factor] = []
-    intrinsics = f"intrinsics/{model.name}"
-    if len(points[0]) or len(lines[0]):
-        variables[intrinsics] = Variables(Euclidean(model.num_parameters, "intrinsics"), params[None], True)
-    for group, (seen, place, sigma) in (("points", points), ("lines", lines)):
+    for group, (seen, sigma) in (("points", points), ("lines", lines)):
         if not len(seen):
             continue
-        zeros = np.zeros(len(seen), np.int64)
+        zeros, own = np.zeros(len(seen), np.int64), Ref(group, np.arange(len(seen)))
         common = {
-            "camera_model": model, "pose": Ref("frames", zeros), "intrinsics": Ref(intrinsics, zeros),
+            "camera_model": model, "pose": Ref("frames", zeros), "intrinsics": Ref("intrinsics", zeros),
             "sqrt_information": 1.0 / sigma,
         }  # fmt: skip
-        own = Ref(group, np.arange(len(seen)))
         if group == "points":
-            variables[group] = Variables(Euclidean(3, "point"), place, True)
             factors.append(PointReprojection(point=own, pixels=seen, **common))
         else:
-            chart = LINE_CHARTS["cartesian"]
-            variables[group] = Variables(chart, chart.from_ambient(place), True)
             factors.append(LineReprojection(line=own, segments=seen, **common))
-    return Problem(variables, factors)
+    return tuple(factors)

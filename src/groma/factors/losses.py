@@ -36,7 +36,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
 from typing import Any, ClassVar, TypeVar
 
@@ -191,7 +191,7 @@ class Loss:
     @property
     def parameters(self) -> tuple[float, ...]:
         """The values of the fields, in their order, as the kernel takes them."""
-        return tuple(float(value) for value in astuple(self))
+        return tuple(float(getattr(self, field.name)) for field in fields(self))
 
     def scaled(self, factor: float) -> Loss:
         """Return the loss that bends at so many times the scale; one without a scale stays as it is."""

@@ -197,7 +197,7 @@ class Localizer:
             described = time.perf_counter()
             images = self._alike(query.points)
             pose, last = self._coarsely(query, camera, options, images)
-            if pose.status != "localized":
+            if pose.status != "localized" and not pose.settled:
                 pose, last = self._fully(query, camera, options, images)
         done = time.perf_counter()
         return LocalizedImage(pose, last.points[:, 1], last.lines[:, 1], described - start, done - described)

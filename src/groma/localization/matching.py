@@ -23,35 +23,14 @@ class MatchGates:
 
 
 MATCHES = MatchGates()
-#: Rows and columns that are compared at a time: their products stay in the cache (cost: the result does not depend on
-#: it).
-_ROWS, _COLUMNS = 512, 512
+#: Rows that one thread compares, and rows and columns that are compared at a time (cost: the result does not depend on
+#: them).
+_OF_THREAD, _ROWS, _COLUMNS = 1024, 256, 512
 Vectors = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
 
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
-@loop
-def _compare(alike, row, column, best, top, second):
-    """Best and second best so far of each row of a block; few blocks of columns hold any, which a count tells."""
-    for i in range(alike.shape[0]):
-        one, two, at = top[row + i], second[row + i], best[row + i]
-        for begin in range(0, alike.shape[1], 64):
-            end = min(begin + 64, alike.shape[1])
-            more = np.int32(0)
-            for j in range(begin, end):
-                more += np.int32(alike[i, j] > two)
-            if more == 0:
-                continue
-            for j in range(begin, end):
-                value = alike[i, j]
-                if value > one:
-                    one, two, at = value, one, column + j
-                elif value > two:
-                    two = value
-        best[row + i], top[row + i], second[row + i] = at, one, two
-
-
 @loop
 def _compare_far(alike, row, column, places, pixels, square, top):
     """The best so far of each row of a block among pixels that are farther from its place than some distance."""
@@ -131,20 +110,29 @@ def match_descriptors(first: Vectors, second: Vectors) -> IntArray:
     """Return pairs (m, 2) of rows of two sets of descriptors of length one."""
     if len(first) < 2 or len(second) < 2:
         return np.zeros((0, 2), np.int64)
-    best = np.zeros(len(first), np.int64)
-    top, next_best = np.full((2, len(first)), -2.0, np.float32)
-
-    def compare(rows: slice) -> None:
-        for column in range(0, len(second), _COLUMNS):
-            alike = first[rows] @ second[column : column + _COLUMNS].T
-            _compare(alike, rows.start, column, best, top, next_best)
-
-    map_ranges(compare, len(first), _ROWS)
-    far, farther = _distance(top), _distance(next_best)
+    best, far, farther = _nearest_two(first, second)
     rows = np.flatnonzero((far <= MATCHES.distance) & (far <= MATCHES.ratio * farther))
     columns, which = np.unique(best[rows], return_inverse=True)
-    mutual = (first @ second[columns].T).argmax(axis=0)[which.ravel()] == rows if len(rows) else rows == 0
+    mutual = _nearest_two(second[columns], first)[0][which.ravel()] == rows
     return np.column_stack([rows[mutual], best[rows[mutual]]])
+
+
+def _nearest_two(first: Vectors, second: Vectors) -> tuple[IntArray, FloatArray, FloatArray]:
+    """The nearest of a second set of vectors for each of a first one, its distance, and that of the next."""
+    best, top = np.empty(len(first), np.int64), np.empty((2, len(first)), np.float32)
+
+    def compare(part: slice) -> None:
+        products = np.empty((_ROWS, len(second)), np.float32)  # new memory for each block takes longer than they do
+        for row in range(part.start, part.stop, _ROWS):
+            rows = slice(row, min(row + _ROWS, part.stop))
+            alike = np.matmul(first[rows], second.T, out=products[: rows.stop - row])
+            best[rows] = alike.argmax(axis=1)
+            at = np.arange(len(alike)), best[rows]
+            top[0, rows], alike[at] = alike[at], -2.0
+            top[1, rows] = alike.max(axis=1)
+
+    map_ranges(compare, len(first), _OF_THREAD)
+    return best, *_distance(top)
 
 
 def alike_elsewhere(

@@ -123,7 +123,7 @@ class CommonErrors:
         J = np.concatenate([refined.points.by_pose[kept[0]], refined.lines.by_pose[kept[1]]])
         r = np.concatenate([refined.points.value[kept[0]], refined.lines.value[kept[1]]])
         weight = (1.0 + (r**2).sum(axis=1) / last_scale(len(r)) ** 2) ** -2
-        pull = weight[:, None, None] * np.swapaxes(J, 1, 2)
+        pull = weight[:, None, None] * J
         place = [np.cumsum(kept[0]) - 1, np.cumsum(kept[1]) - 1 + int(kept[0].sum())]
         K = np.zeros((len(self.covariance), J.shape[2]))
         one = refined.one
@@ -132,17 +132,22 @@ class CommonErrors:
             own, agree = (self.lines if lines else self.points), kept[int(lines)][part.row]
             matched = part.row[agree]
             row, seen = place[int(lines)][matched], landmarks[int(lines)][matched]
-            wanted = {part.kind[:-1]: own.motion.shape[1], "intrinsics": len(one.params)}
-            record = white[agree] @ one.records(part, wanted)[agree][..., :-1]
+            record = white[agree] @ one.records(part, "landmark", "lens")[agree][..., :-1]
             by_own, by_lens = np.split(record, [own.motion.shape[1]], axis=2)
-            _pull_views(own.begin, own.seen, own.motion, seen, pull[row] @ by_own, 6 * self.frames, K)
+            moved = np.swapaxes(pull[row], 1, 2) @ by_own
+            _pull_views(own.begin, own.seen, own.motion, seen, moved, 6 * self.frames, K)
             if camera is not None and self.parameters and part.has_lens:
                 first = 6 * self.frames + camera * self.parameters
-                K[first : first + by_lens.shape[2]] += np.einsum("nik,nkj->ji", pull[row], by_lens)
-        H = np.einsum("nik,nkj->ij", pull, J) + refined.prior
+                K[first : first + by_lens.shape[2]] += _product(by_lens, pull[row])
+        H = _product(pull, J) + refined.prior
         scale = 1.0 / np.sqrt(np.diag(H))
         step = (K * scale) @ np.linalg.inv(H * np.outer(scale, scale)) * scale
         return (step.T @ self.covariance @ step)[:6, :6]
+
+
+def _product(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Sum of the products (i, j) of matrices (n, k, i), transposed, and (n, k, j)."""
+    return first.reshape(-1, first.shape[2]).T @ second.reshape(-1, second.shape[2])
 
 
 def common_errors(

@@ -47,7 +47,7 @@ def without_image(camera: QueryCamera, matches: Matches, pose: FloatArray) -> Ma
     good, good_lines = np.zeros(matches.num_points, bool), np.zeros(matches.num_lines, bool)
     for part in one.parts:
         rows, landmarks = part.row, part.landmarks[part.row]
-        white = one.whitened(part, {part.kind[:-1]: landmarks.shape[1]})
+        white = one.whitened(part, "landmark")
         if part.kind == "points":
             step, covariance, kept = _downdated(white, point_covariance[rows], np.eye(3)[None])
             points3d[rows], point_covariance[rows], good[rows] = points3d[rows] + step, covariance, kept

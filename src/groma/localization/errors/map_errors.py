@@ -87,11 +87,12 @@ def _case(image: SeenByImage) -> _Case | None:
     if matches.num_points + matches.num_lines < GATES.matches:
         return None
     found = refine(image.camera, matches, image.pose, max_errors(matches))
-    noise = found.noise_covariance(matches)
+    cell = found.cells(matches)
+    noise = found.noise_covariance(cell)
     if not np.isfinite(noise).all():
         return None
     difference = se3.log(se3.compose(image.pose[None], se3.inverse(found.pose[None])))[0]
-    return difference, noise + image.difference, found.shared_covariance(matches)
+    return difference, noise + image.difference, found.shared_covariance(cell, matches.shared_error)
 
 
 def _shared_error(cases: Sequence[_Case | None], gates: MapErrorGates) -> float:

@@ -126,6 +126,9 @@ class AbsolutePose:
     #: Whether what agrees would do, but what else the photograph shows, or does not, speaks against the pose; more
     #: matches would hardly change that.
     contradicted: bool = False
+    #: Whether it is something that all features near the pose say, however it was found: more matches to find one by
+    #: change nothing.
+    settled: bool = False
 
     @property
     def center(self) -> FloatArray | None:
@@ -287,6 +290,7 @@ def _judged(
         best.sigma0,
         rival if verdict.status == "uncertain" else None,
         verdict.contradicted,
+        verdict.settled,
     )
 
 

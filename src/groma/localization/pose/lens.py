@@ -23,7 +23,7 @@ from groma.localization.pose.gates import REFINEMENT, VERDICT, VerdictGates
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pose_fit import full_step
 from groma.localization.pose.pose_problem import problem_of
-from groma.localization.pose.refinement import Refined, fitted, refine, weighed
+from groma.localization.pose.refinement import Refined, fitted_at, refine, weighed
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class LensStep:
     """How far an estimate of a lens is from the one that was given."""
 
     #: The share by which the focal length should grow, and its standard deviation; the latter is infinite where that is
-    #: not determined.
+    #: not determined, and where the share is too small to tell another lens.
     focal: float
     focal_sigma: float
     #: How far the principal point moves if it is estimated, too, focal lengths; and the squared step of both in units
@@ -73,17 +73,18 @@ def lens_step(
         return LensStep(focal, np.inf)
     some = _evenly(matches, GATES.matches)
     found = refine(refined.camera, some, refined.pose, max_error, free_lens(refined.camera, "focal"), gathered=True)
-    focal, covariance = _step(refined, found, some)
-    told = LensStep(float(focal[0]), float(np.sqrt(covariance[0, 0])))
+    focal, sigma = float(_step(refined, found)[0]), np.inf
+    if abs(focal) > gates.focal:
+        sigma = float(np.sqrt(found.joint_covariance(some)[6, 6]))
     points, whole = refined.camera.kind.principal_point_indices, free_lens(refined.camera, "pinhole")
-    if not points or not _may_be_far(fitted(found.camera, some, found.pose, max_error, whole), 0.5 * gates.shift):
-        return told
+    if not points or not _may_be_far(fitted_at(found.one, found.camera, some, max_error, whole), 0.5 * gates.shift):
+        return LensStep(focal, sigma)
     found = refine(refined.camera, some, refined.pose, max_error, whole, gathered=True)
-    step, covariance = _step(refined, found, some)
+    step, covariance = _step(refined, found), found.joint_covariance(some)[6:, 6:]
     if not np.isfinite(covariance).all():
-        return told
+        return LensStep(focal, sigma)
     square = float(step @ np.linalg.solve(covariance, step))
-    return LensStep(told.focal, told.focal_sigma, float(np.linalg.norm(step[1:])), square)
+    return LensStep(focal, sigma, float(np.linalg.norm(step[1:])), square)
 
 
 def _one_step(refined: Refined, matches: Matches) -> tuple[float, float]:
@@ -97,14 +98,12 @@ def _one_step(refined: Refined, matches: Matches) -> tuple[float, float]:
     return (np.inf, np.inf) if step is None else (float(step[6]), float(np.linalg.norm(step[7:])))
 
 
-def _step(given: Refined, found: Refined, matches: Matches) -> tuple[FloatArray, FloatArray]:
-    """Steps (k,) of what was estimated of a lens, from the one that was given, and their covariance."""
-    covariance = found.joint_covariance(matches)[6:, 6:]
+def _step(given: Refined, found: Refined) -> FloatArray:
+    """Steps (3,) of focal length and principal point, from those of the lens that was given."""
     kind, params = found.camera.kind, given.camera.params
     focal = kind.focal_length(params)
     center = (found.camera.params - params)[list(kind.principal_point_indices)] / focal
-    step = np.append(np.log(kind.focal_length(found.camera.params) / focal), center)
-    return step[: len(covariance)], covariance
+    return np.append(np.log(kind.focal_length(found.camera.params) / focal), center)
 
 
 def _may_be_far(here: Refined, limit: float) -> bool:

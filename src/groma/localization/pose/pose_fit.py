@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,9 +21,9 @@ from groma.factors.losses import Loss, loss_derivatives
 from groma.localization.pose.free_lens import FreeLens
 from groma.localization.pose.one_pose import OnePose
 from groma.solver.damped_problem import Trial
-from groma.solver.levenberg_marquardt import NielsenDamping, predicted_decrease
+from groma.solver.levenberg_marquardt import NielsenDamping
+from groma.solver.linear.lapack import potrf, potrs
 from groma.solver.options import SolverOptions
-from groma.solver.steps import largest_slope
 from groma.solver.termination import cost_converged
 
 #: Of a fit that only collects what is near, and of the last one (cost: of steps).
@@ -82,39 +83,30 @@ def fit_pose(
         What is estimated of the camera, too; else it is held.
     """
     kept: dict[str, BoolArray] = dict(zip(("points", "lines"), near, strict=True))
-    rows = [part.of_rows(kept) for part in start.parts]
-    count = sum(int(row.sum()) for row in rows)
-
-    def at(one: OnePose) -> _Sum:
-        return _sum(one, weights, rows, loss, lens)
-
-    here, damping, fell = at(start), NielsenDamping(_DAMPING), 0.0
+    rows = np.concatenate([np.zeros(0, bool), *(part.of_rows(kept) for part in start.parts)])
+    at = _Sums(start, weights, rows, loss, lens)
+    here, damping, fell, count = at(start), NielsenDamping(_DAMPING), 0.0, int(rows.sum())
     if not math.isfinite(here.cost) or here.hidden == count:
         return start
     share = here.cost / max(1, count)
     for iteration in range(options.max_iterations):
-        H, g = here.total[:-1, :-1], here.total[:-1, -1]
-        diagonal = np.diag(H)
-        if largest_slope(g, diagonal) <= options.gradient_tolerance:
+        found = _step(here.total, damping.value)
+        if found is None or found.slope <= options.gradient_tolerance:
             break
-        step = _step(H, g, diagonal, damping.value)
-        if step is None:
-            break
-        promised, withheld = predicted_decrease([(diagonal, g, step)], None, (0.0, 0.0), damping.value)
-        params = here.one.params if lens is None else lens.moved(here.one.params, step[6:])
-        moved = here.one.after(step[:6], params)
-        if promised <= options.function_tolerance * here.cost:
+        params = here.one.params if lens is None else lens.moved(here.one.params, found.step[6:])
+        moved = here.one.after(found.step[:6], params)
+        if found.promised <= options.function_tolerance * here.cost:
             # The last step is taken without asking the cost; where the start is as good, none is.
             return moved if iteration else start
         tried = at(moved)
-        ratio = (here.cost - tried.cost) / promised
+        ratio = (here.cost - tried.cost) / found.promised
         if not tried.cost + max(0, tried.hidden - here.hidden) * share < here.cost:
             fell = 0.0
             if damping.refuse(Trial(tried.cost)) is not None:
                 break
             continue
         damping.accept(ratio)
-        before, fell, held = fell, (here.cost - tried.cost) / here.cost, withheld / here.cost
+        before, fell, held = fell, (here.cost - tried.cost) / here.cost, found.withheld / here.cost
         here = tried
         if cost_converged(fell, before, ratio, held, options.function_tolerance):
             break
@@ -123,9 +115,8 @@ def fit_pose(
 
 def full_step(one: OnePose, weights: Sequence[FloatArray], loss: Loss, lens: FreeLens) -> FloatArray | None:
     """Return the undamped step (6 + k,) of a pose and a lens by all matches; None where they do not determine it."""
-    here = _sum(one, weights, [np.ones(len(part.row), bool) for part in one.parts], loss, lens)
-    H = here.total[:-1, :-1]
-    return _step(H, here.total[:-1, -1], np.diag(H), 0.0)
+    found = _step(_Sums(one, weights, np.ones(sum(map(len, weights)), bool), loss, lens)(one).total, 0.0)
+    return None if found is None else found.step
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,31 +129,54 @@ class _Sum:
     total: FloatArray
 
 
-def _sum(
-    one: OnePose, weights: Sequence[FloatArray], near: Sequence[BoolArray], loss: Loss, lens: FreeLens | None
-) -> _Sum:
-    cost, hidden, total = 0.0, 0, np.zeros(())
-    wanted = {"pose": 6} if lens is None else {"pose": 6, "intrinsics": len(one.params)}
-    for part, weight, own in zip(one.parts, weights, near, strict=True):
-        record = one.records(part, wanted)
-        more, blind = _weigh(record, weight, own, loss.tag, loss.parameters)
-        rows = record.reshape(-1, record.shape[2])
-        if lens is not None:
-            rows = np.column_stack([rows[:, :6], rows[:, 6:-1] @ lens.directions(one.params), rows[:, -1]])
-        cost, hidden, total = cost + more, hidden + blind, total + rows.T @ rows
-    if lens is not None and len(near):
-        prior = lens.prior(one.params)
-        cost, total = cost + 0.5 * float(prior[-1, -1]), total + prior
-    return _Sum(one, cost, hidden, total)
+class _Sums:
+    """Sums over the matches that are near, at one pose after the other; all are written to one array."""
+
+    def __init__(
+        self, one: OnePose, weights: Sequence[FloatArray], near: BoolArray, loss: Loss, lens: FreeLens | None
+    ) -> None:
+        self._near, self._lens, self._loss = near, lens, (loss.tag, loss.parameters)
+        self._weight = np.concatenate([np.zeros((0, 2, 2)), *weights])
+        self._record = np.zeros((len(near), 2, 7 + (0 if lens is None else len(one.params))))
+
+    def __call__(self, one: OnePose) -> _Sum:
+        one.write(self._record, self._lens is not None)
+        cost, hidden = _weigh(self._record, self._weight, self._near, *self._loss)
+        rows = self._record.reshape(-1, self._record.shape[2])
+        total = rows.T @ rows
+        if self._lens is not None:
+            directions = self._lens.directions(one.params)
+            moved = np.zeros((len(total), 7 + directions.shape[1]))
+            moved[:6, :6], moved[6:-1, 6:-1], moved[-1, -1] = np.eye(6), directions, 1.0
+            prior = self._lens.prior(one.params)
+            cost, total = cost + 0.5 * float(prior[-1, -1]), moved.T @ total @ moved + prior
+        return _Sum(one, cost, hidden, total)
 
 
-def _step(H: FloatArray, g: FloatArray, diagonal: FloatArray, damping: float) -> FloatArray | None:
-    """The damped step; None where there is none."""
-    if not (diagonal > 0.0).all():
+class _Step(NamedTuple):
+    """A damped step, the decrease that the quadratic model promises and what the damping holds back of it, and the
+    largest component of the gradient, each divided by the root of its curvature.
+    """
+
+    step: FloatArray
+    promised: float
+    withheld: float
+    slope: float
+
+
+def _step(total: FloatArray, damping: float) -> _Step | None:
+    """The damped step by products of derivatives and residuals; None where there is none."""
+    scale = np.sqrt(total.diagonal())
+    scale[-1] = 1.0
+    if not scale.min() > 0.0:
         return None
-    scale = 1.0 / np.sqrt(diagonal)
-    try:
-        scaled = H * np.outer(scale, scale) + damping * np.eye(len(g))
-        return -scale * np.linalg.solve(scaled, scale * g)
-    except np.linalg.LinAlgError:
+    scaled = total / np.outer(scale, scale)
+    scaled.flat[:: len(scaled) + 1] = 1.0 + damping
+    gradient = scaled[:-1, -1]
+    factor, failed = potrf(scaled[:-1, :-1])
+    if failed:
         return None
+    step = potrs(factor, -gradient)[0]
+    held = damping * float(step @ step)
+    promised = 0.5 * (held - float(gradient @ step))
+    return _Step(step / scale[:-1], promised, held, float(np.abs(gradient).max()))

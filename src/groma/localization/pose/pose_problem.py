@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The problem of one pose and its matches: without a scene, unless lens or lines ask for one."""
+"""The problem of one pose and its matches: without a scene, unless lines under distortion ask for one."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +11,12 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
-from groma.adjustment.one_image import one_image_problem
+from groma.adjustment.one_image import one_image_factors
+from groma.factors.contract import Factor
+from groma.geometry import line3
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.matches import Matches
-from groma.localization.pose.one_pose import OnePose
+from groma.localization.pose.one_pose import OnePose, Part
 from groma.scene import LineObservations, Lines, PointObservations, Points, Scene
 
 _ASSEMBLY = AssemblyOptions(
@@ -23,13 +26,19 @@ _ASSEMBLY = AssemblyOptions(
 
 def problem_of(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_lens: bool = False) -> OnePose:
     """The problem of one pose, with the noise of the image alone."""
-    lines = Lines.through(matches.segments3d)
-    if camera.kind.has_pinhole_parameters or not matches.num_lines:
-        problem = one_image_problem(
-            (camera.kind, camera.params), pose, (matches.points2d, matches.points3d, matches.point_sigma),
-            (matches.segments2d.reshape(-1, 4), lines.plucker, matches.segment_sigma),
-        )  # fmt: skip
-        return OnePose.of(problem, camera.params)
+    if matches.num_lines and not camera.kind.has_pinhole_parameters:
+        return OnePose(assembled(camera, matches, pose, refine_lens), pose, camera.params)
+    factors = one_image_factors(
+        camera.kind, (matches.points2d, matches.point_sigma),
+        (matches.segments2d.reshape(-1, 4), matches.segment_sigma),
+    )  # fmt: skip
+    lines = line3.from_points(*matches.segments3d.swapaxes(0, 1))
+    places = {"points": matches.points3d, "lines": lines / np.linalg.norm(lines[:, 3:], axis=1, keepdims=True)}
+    return OnePose(_parts(factors, places), pose, camera.params)
+
+
+def assembled(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_lens: bool) -> tuple[Part, ...]:
+    """The parts of the same problem as they are made of a scene."""
     image = np.zeros(matches.num_points, np.int64), np.zeros(matches.num_lines, np.int64)
     scene = Scene.from_images(
         camera.table(), ["query"], [0], pose[None],
@@ -37,9 +46,17 @@ def problem_of(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_l
         point_observations=PointObservations.numbered(
             image[0], np.arange(matches.num_points), matches.points2d, matches.point_sigma
         ),
-        lines=lines,
+        lines=Lines.through(matches.segments3d),
         line_observations=LineObservations(
             image[1], np.arange(matches.num_lines), matches.segments2d.reshape(-1, 4), matches.segment_sigma
         ),
     )  # fmt: skip
-    return OnePose.of(assemble(scene, replace(_ASSEMBLY, refine_intrinsics=refine_lens)).problem, camera.params)
+    problem = assemble(scene, replace(_ASSEMBLY, refine_intrinsics=refine_lens)).problem
+    places = {name: np.ascontiguousarray(group.ambient()) for name, group in problem.variables.items()}
+    return _parts(problem.factors, places)
+
+
+def _parts(factors: Sequence[Factor], places: Mapping[str, FloatArray]) -> tuple[Part, ...]:
+    landmarks = [factor.references()[1][1] for factor in factors]
+    made = zip(factors, landmarks, strict=True)
+    return tuple(Part(factor, own.group, own.index, places[own.group]) for factor, own in made)

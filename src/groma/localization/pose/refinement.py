@@ -45,7 +45,6 @@ from groma.localization.pose.matches import Matches, nearest_claims
 from groma.localization.pose.one_pose import OnePose
 from groma.localization.pose.pose_fit import FINELY, ROUGHLY, fit_pose
 from groma.localization.pose.pose_problem import problem_of
-from groma.localization.pose.records import times
 from groma.localization.pose.residuals import Residuals, residuals
 
 #: Information of scaled unknowns below which they are not determined.
@@ -113,28 +112,29 @@ class Refined:
 
     def joint_covariance(self, matches: Matches) -> FloatArray:
         """(6 + k, 6 + k) covariance of the left twist and of what is estimated of the lens."""
-        noise = self.noise_covariance(matches)
+        cell = self.cells(matches)
+        noise = self.noise_covariance(cell)
         if matches.shared_error == 0.0 or not np.isfinite(noise).all():
             return noise
-        return noise + matches.shared_error**2 * self.shared_covariance(matches)
+        return noise + matches.shared_error**2 * self.shared_covariance(cell, matches.shared_error)
 
-    def shared_covariance(self, matches: Matches) -> FloatArray:
-        """Covariance of the same if what each cell shows is off by one radian, together."""
+    def shared_covariance(self, cell: IntArray, error: float) -> FloatArray:
+        """Covariance of the same if what each cell shows is off by one radian, together; ``error`` is how far it is."""
         chosen = ((self.points, self.point_inliers), (self.lines, self.line_inliers))
-        J = np.concatenate([found.by_pose[kept] * np.sqrt(found.spread[kept, None, None]) for found, kept in chosen])
-        cell = self._cells(matches)
-        J /= float(self.camera.kind.focal_length(self.camera.params))
-        information = np.einsum("n,nki,nkj->ij", 1.0 / np.bincount(cell)[cell], J, J)
-        information += self.prior * matches.shared_error**2
+        J = np.concatenate([found.by_pose[kept] for found, kept in chosen])
+        spread = np.concatenate([found.spread[kept] for found, kept in chosen])
+        J = J * np.sqrt(spread / np.bincount(cell)[cell])[:, None, None]
+        J = J.reshape(-1, J.shape[2]) / float(self.camera.kind.focal_length(self.camera.params))
+        information = J.T @ J + self.prior * error**2
         scale = 1.0 / np.sqrt(np.diag(information))
         return np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
 
-    def _cells(self, matches: Matches) -> IntArray:
+    def cells(self, matches: Matches) -> IntArray:
         """Number the matches that agree by the cells of the image that they lie in."""
         middle = matches.segments2d.mean(axis=1)[self.line_inliers]
         return cells_of(np.concatenate([matches.points2d[self.point_inliers], middle]), self.camera, REFINEMENT.cells)
 
-    def noise_covariance(self, matches: Matches) -> FloatArray:
+    def noise_covariance(self, cell: IntArray) -> FloatArray:
         """Covariance of the same by the noise of image and landmarks alone."""
         chosen = ((self.points, self.point_inliers), (self.lines, self.line_inliers))
         J = np.concatenate([found.by_pose[kept] for found, kept in chosen])
@@ -148,12 +148,9 @@ class Refined:
         if not values[0] > _SINGULAR:
             return np.full((J.shape[2], J.shape[2]), np.inf)
         root = sigma * vectors / np.sqrt(values) / scale[:, None]
-        cell = self._cells(matches)
         count, dof = int(cell.max()) + 1, len(scale)
-        gradient = np.zeros((count, dof))
-        pulled = np.einsum("nki,nk->ni", J @ (root / sigma), pull / sigma)
-        for k in range(dof):
-            gradient[:, k] = np.bincount(cell, pulled[:, k], count)
+        pulled = (pull[:, None, :] @ J)[:, 0] @ (root / sigma**2)
+        gradient = np.stack([np.bincount(cell, column, count) for column in pulled.T], axis=1)
         if count > dof:
             shared, axes = np.linalg.eigh(gradient.T @ gradient * (count / (count - dof)))
             by_chance = (1.0 + np.sqrt(dof / count)) ** 2  # the largest such eigenvalue of independent errors
@@ -319,10 +316,9 @@ def weighed(one: OnePose, matches: Matches) -> tuple[tuple[FloatArray, ...], tup
     squares = {"points": np.full(matches.num_points, np.inf), "lines": np.full(matches.num_lines, np.inf)}
     weights = []
     for part in one.parts:
-        image = np.broadcast_to(times(part.factor.sqrt_information, np.eye(2)[None]), (len(part.row), 2, 2))
         covariance, weight = covariances[part.kind], np.empty((len(part.row), 2, 2))
-        record = one.records(part, {part.kind[:-1]: covariance.shape[1]})
-        _weigh(image, record, covariance, part.row, weight, squares[part.kind])
+        record = one.records(part, "landmark")
+        _weigh(part.noise, record, covariance, part.row, weight, squares[part.kind])
         weights.append(weight)
     return tuple(weights), (squares["points"], squares["lines"])
 

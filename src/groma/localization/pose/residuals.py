@@ -50,7 +50,7 @@ def residuals(
         if part.kind != landmarks:
             continue
         known = more > 0 and part.has_lens
-        record = one.records(part, {"pose": 6, "intrinsics": len(lens)} if known else {"pose": 6})
+        record = one.records(part, "pose", *(["lens"] if known else []))
         white = weight @ record
         seen = (record != 0.0).any(axis=(1, 2))  # what cannot be evaluated is zero
         rows = part.row

@@ -88,10 +88,12 @@ class Verdict:
     sentence: str
     #: Whether something speaks against the pose that more matches would hardly change.
     contradicted: bool = False
+    #: Whether it is something that all features near the pose say, however it was found.
+    settled: bool = False
 
     def doubted(self, why: str, probability: float = 0.5) -> Verdict:
         """The same of a pose that something else speaks against: by itself right with this probability, or even."""
-        return Verdict("uncertain", self.probability * probability, f"{self.sentence} But {why}", True)
+        return Verdict("uncertain", self.probability * probability, f"{self.sentence} But {why}", True, True)
 
 
 class Instead(NamedTuple):
