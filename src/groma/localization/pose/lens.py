@@ -11,6 +11,7 @@ doubt, it is the answer.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,7 +56,11 @@ class LensStep:
 
 
 def lens_step(
-    refined: Refined, matches: Matches, max_error: tuple[float, float], gates: VerdictGates = VERDICT
+    refined: Refined,
+    matches: Matches,
+    max_error: tuple[float, float],
+    common: Callable[[Refined, Matches, int], FloatArray] | None = None,
+    gates: VerdictGates = VERDICT,
 ) -> LensStep:
     """Estimate the focal length near a pose, and the principal point if it may be far.
 
@@ -65,25 +70,40 @@ def lens_step(
         A pose with the lens that was given, and what was looked for near it.
     max_error
         Of :func:`groma.localization.pose.refinement.refine`.
+    common
+        What errors of the map add to the joint covariance of a fit to each so many-th match; None: nothing.
     gates
         What far means.
     """
     focal, shift = _one_step(refined, matches)
     if abs(focal) <= GATES.small * gates.focal and shift <= GATES.small * gates.shift:
         return LensStep(focal, np.inf)
-    some = _evenly(matches, GATES.matches)
+    each = -(-(matches.num_points + matches.num_lines) // GATES.matches)
+    some = matches.take(np.arange(0, matches.num_points, each), np.arange(0, matches.num_lines, each))
+
+    def step(found: Refined) -> tuple[FloatArray, FloatArray]:
+        """Steps (k,) of what was estimated of a lens, from the one that was given, and their covariance."""
+        covariance = found.joint_covariance(some)
+        if common is not None and np.isfinite(covariance).all():
+            covariance = covariance + common(found, matches, each)
+        kind, params = found.camera.kind, refined.camera.params
+        focal = kind.focal_length(params)
+        center = (found.camera.params - params)[list(kind.principal_point_indices)] / focal
+        way = np.append(np.log(kind.focal_length(found.camera.params) / focal), center)
+        return way[: len(covariance) - 6], covariance[6:, 6:]
+
     found = refine(refined.camera, some, refined.pose, max_error, free_lens(refined.camera, "focal"), gathered=True)
-    focal, covariance = _step(refined, found, some)
+    focal, covariance = step(found)
     told = LensStep(float(focal[0]), float(np.sqrt(covariance[0, 0])))
     points, whole = refined.camera.kind.principal_point_indices, free_lens(refined.camera, "pinhole")
     if not points or not _may_be_far(fitted(found.camera, some, found.pose, max_error, whole), 0.5 * gates.shift):
         return told
     found = refine(refined.camera, some, refined.pose, max_error, whole, gathered=True)
-    step, covariance = _step(refined, found, some)
+    way, covariance = step(found)
     if not np.isfinite(covariance).all():
         return told
-    square = float(step @ np.linalg.solve(covariance, step))
-    return LensStep(told.focal, told.focal_sigma, float(np.linalg.norm(step[1:])), square)
+    square = float(way @ np.linalg.solve(covariance, way))
+    return LensStep(told.focal, told.focal_sigma, float(np.linalg.norm(way[1:])), square)
 
 
 def _one_step(refined: Refined, matches: Matches) -> tuple[float, float]:
@@ -97,25 +117,9 @@ def _one_step(refined: Refined, matches: Matches) -> tuple[float, float]:
     return (np.inf, np.inf) if step is None else (float(step[6]), float(np.linalg.norm(step[7:])))
 
 
-def _step(given: Refined, found: Refined, matches: Matches) -> tuple[FloatArray, FloatArray]:
-    """Steps (k,) of what was estimated of a lens, from the one that was given, and their covariance."""
-    covariance = found.joint_covariance(matches)[6:, 6:]
-    kind, params = found.camera.kind, given.camera.params
-    focal = kind.focal_length(params)
-    center = (found.camera.params - params)[list(kind.principal_point_indices)] / focal
-    step = np.append(np.log(kind.focal_length(found.camera.params) / focal), center)
-    return step[: len(covariance)], covariance
-
-
 def _may_be_far(here: Refined, limit: float) -> bool:
     """Whether one step of all unknowns, by what agrees, moves the principal point farther; or it is not determined."""
     chosen = ((here.points, here.point_inliers), (here.lines, here.line_inliers))
     J = np.concatenate([found.by_pose[kept] for found, kept in chosen]).reshape(-1, 9)
     r = np.concatenate([found.value[kept] for found, kept in chosen]).ravel()
     return not np.linalg.norm(np.linalg.lstsq(J, r)[0][7:]) <= limit
-
-
-def _evenly(matches: Matches, count: int) -> Matches:
-    """Every so many-th match, so that so many are left."""
-    step = -(-(matches.num_points + matches.num_lines) // count)
-    return matches.take(np.arange(0, matches.num_points, step), np.arange(0, matches.num_lines, step))
