@@ -172,6 +172,23 @@ def test_what_a_query_is_off_by_follows_the_map():
         np.testing.assert_allclose(np.outer(way, way) / size**2, told / size**2, atol=0.15)
 
 
+@pytest.mark.kernels
+def test_an_error_of_the_calibration_that_a_query_shares_is_in_how_far_its_own_lens_is_from_it():
+    """Where the landmarks stay, a query finds its own focal length and pose, whatever the map says of the former."""
+    world = _map(3)
+    errors = world.errors()
+    assert errors is not None
+    still = [replace(one, motion=np.zeros_like(one.motion)) for one in (errors.points, errors.lines)]
+    lens, limit = free_lens(world.camera, "focal"), max_errors(world.matches)
+    found = refine(world.camera, world.matches, world.start(), limit, lens, gathered=True)
+    step = np.zeros(len(errors.covariance))
+    step[6 * world.scene.num_frames :][:2] = 0.01 * found.camera.params[:2]
+    alone = replace(errors, covariance=np.outer(step, step), points=still[0], lines=still[1])
+    told = alone.of_query(found, world.landmarks, 0)
+    np.testing.assert_allclose(told, np.diag([0.0] * 6 + [0.01**2]), atol=1e-9)
+    assert not alone.of_query(found, world.landmarks).any()
+
+
 def _moved(world, step):
     """The matches with the landmarks that other poses and calibrations give."""
     scene, frames = world.scene, world.scene.num_frames

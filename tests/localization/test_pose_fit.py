@@ -124,7 +124,7 @@ def test_the_stated_deviation_of_a_focal_length_is_true():
         world, matches = noisy(rng, 60, 10)
         best = refine(CAMERA, matches, world.pose, max_errors(matches))
         always = replace(VERDICT, focal=0.0, shift=0.0)  # the principal point is estimated, too
-        told = lens_step(best, matches, max_errors(matches), always)
+        told = lens_step(best, matches, max_errors(matches), gates=always)
         squares.append(((told.focal / told.focal_sigma) ** 2, told.square))
     of_focal, of_both = np.mean(squares, axis=0)
     # The sum is chi-square with 100 degrees: 0.999 of such are between 60 and 153. The variance is estimated besides.

@@ -244,6 +244,7 @@ class Localizer:
         """The pose from matches of a part of a query, those that it guides to, and what mirrored points match."""
         near = nearest_images(self.index, images, found.points[:, 1], self.options.gates.near)
         matches = found.matches(part, self.scene, self.index)
+        own_camera = None if options.refine_lens else self._own_camera(camera)
         tried = [(matches, found)]
 
         def guided(best: Refined) -> Matches:
@@ -272,17 +273,17 @@ class Localizer:
         def telling(used: Matches) -> BoolArray:
             return seen_in_them(used).telling(part, self.index)
 
-        def common(best: Refined, used: Matches) -> FloatArray:
-            if self._common is None:
-                return np.zeros((6, 6))
-            landmarks = seen_in_them(used).points[:, 1], seen_in_them(used).lines[:, 1]
-            return self._common.of_query(best, landmarks, self._own_camera(best.camera))
+        def common(best: Refined, used: Matches, step: int) -> FloatArray:
+            assert self._common is not None
+            landmarks = seen_in_them(used).points[::step, 1], seen_in_them(used).lines[::step, 1]
+            return self._common.of_query(best, landmarks, own_camera)
 
         mirror = MirrorImage(
             query, part, camera, self.scene, self.index, lambda points: matched(points, self._alike(points)),
             self.options.gates.near,
         )  # fmt: skip
-        of_map = MapQuestions(guided, MirrorQuestions(mirror.matches, closest), expected, common, telling)
+        errors = None if self._common is None else common
+        of_map = MapQuestions(guided, MirrorQuestions(mirror.matches, closest), expected, errors, telling)
         pose = pose_from_matches(camera, matches, options, max(len(images), 1), enough, of_map)
         return pose, seen_in_them(pose.matches)
 

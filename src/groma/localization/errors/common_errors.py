@@ -108,7 +108,8 @@ class CommonErrors:
         return self.points.motion.shape[2] - 6
 
     def of_query(self, refined: Refined, landmarks: tuple[IntArray, IntArray], camera: int | None = None) -> FloatArray:
-        """Return what they add to the covariance (6, 6) of the pose of a query.
+        """Return what they add to the covariance (6 + k, 6 + k) of the pose of a query, and of what is estimated of its
+        lens, as far from where it was given.
 
         Parameters
         ----------
@@ -142,7 +143,7 @@ class CommonErrors:
         H = _product(pull, J) + refined.prior
         scale = 1.0 / np.sqrt(np.diag(H))
         step = (K * scale) @ np.linalg.inv(H * np.outer(scale, scale)) * scale
-        return (step.T @ self.covariance @ step)[:6, :6]
+        return step.T @ self.covariance @ step
 
 
 def _product(first: FloatArray, second: FloatArray) -> FloatArray:

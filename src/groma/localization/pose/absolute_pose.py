@@ -90,8 +90,9 @@ class MapQuestions:
     mirror: MirrorQuestions | None = None
     #: How much of what a pose puts into the image is there. What only one place has decides between two.
     expected: Callable[[Refined, Matches], Shown] | None = None
-    #: What errors of the poses and calibrations of the map add to the covariance.
-    common: Callable[[Refined, Matches], FloatArray] | None = None
+    #: What errors of the poses and calibrations of the map add to the joint covariance of a fit to each so many-th
+    #: match.
+    common: Callable[[Refined, Matches, int], FloatArray] | None = None
     #: Which matches of points show what only one place of the map has; None: all may.
     telling: Callable[[Matches], BoolArray] | None = None
 
@@ -268,14 +269,14 @@ def _judged(
     best, used = here.best, here.used
     covariance = best.covariance(used)
     if of_map.common is not None and np.isfinite(covariance).all():
-        covariance = covariance + of_map.common(best, used)
+        covariance = covariance + of_map.common(best, used, 1)[:6, :6]
     verdict = judge(best, covariance, median_distance(best.pose, _seen(used, best)), here.evidence, others)
     if verdict.status == "localized":
         verdict = doubted_if_missing(verdict, here.shown.parts, here.shown.missing)
     if of_map.mirror is not None and verdict.status == "localized":
         verdict = _unless_mirrored(verdict, here, of_map.mirror, matches, options)
     if not options.refine_lens and verdict.status == "localized":
-        verdict = doubted_if_other_lens(verdict, lens_step(best, used, _errors(used, options)))
+        verdict = doubted_if_other_lens(verdict, lens_step(best, used, _errors(used, options), of_map.common))
     failed = verdict.status == "failed"
     return AbsolutePose(
         verdict.status,

@@ -11,6 +11,7 @@ doubt, it is the answer.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,7 +56,11 @@ class LensStep:
 
 
 def lens_step(
-    refined: Refined, matches: Matches, max_error: tuple[float, float], gates: VerdictGates = VERDICT
+    refined: Refined,
+    matches: Matches,
+    max_error: tuple[float, float],
+    common: Callable[[Refined, Matches, int], FloatArray] | None = None,
+    gates: VerdictGates = VERDICT,
 ) -> LensStep:
     """Estimate the focal length near a pose, and the principal point if it may be far.
 
@@ -65,25 +70,36 @@ def lens_step(
         A pose with the lens that was given, and what was looked for near it.
     max_error
         Of :func:`groma.localization.pose.refinement.refine`.
+    common
+        What errors of the map add to the joint covariance of a fit to each so many-th match; None: nothing.
     gates
         What far means.
     """
     focal, shift = _one_step(refined, matches)
     if abs(focal) <= GATES.small * gates.focal and shift <= GATES.small * gates.shift:
         return LensStep(focal, np.inf)
-    some = _evenly(matches, GATES.matches)
+    each = -(-(matches.num_points + matches.num_lines) // GATES.matches)
+    some = matches.take(np.arange(0, matches.num_points, each), np.arange(0, matches.num_lines, each))
+
+    def covariance(found: Refined) -> FloatArray:
+        """That of what was estimated of a lens."""
+        joint = found.joint_covariance(some)
+        if common is not None and np.isfinite(joint).all():
+            joint = joint + common(found, matches, each)
+        return joint[6:, 6:]
+
     found = refine(refined.camera, some, refined.pose, max_error, free_lens(refined.camera, "focal"), gathered=True)
     focal, sigma = float(_step(refined, found)[0]), np.inf
     if abs(focal) > gates.focal:
-        sigma = float(np.sqrt(found.joint_covariance(some)[6, 6]))
+        sigma = float(np.sqrt(covariance(found)[0, 0]))
     points, whole = refined.camera.kind.principal_point_indices, free_lens(refined.camera, "pinhole")
     if not points or not _may_be_far(fitted_at(found.one, found.camera, some, max_error, whole), 0.5 * gates.shift):
         return LensStep(focal, sigma)
     found = refine(refined.camera, some, refined.pose, max_error, whole, gathered=True)
-    step, covariance = _step(refined, found), found.joint_covariance(some)[6:, 6:]
-    if not np.isfinite(covariance).all():
+    step, uncertain = _step(refined, found), covariance(found)
+    if not np.isfinite(uncertain).all():
         return LensStep(focal, sigma)
-    square = float(step @ np.linalg.solve(covariance, step))
+    square = float(step @ np.linalg.solve(uncertain, step))
     return LensStep(focal, sigma, float(np.linalg.norm(step[1:])), square)
 
 
@@ -112,9 +128,3 @@ def _may_be_far(here: Refined, limit: float) -> bool:
     J = np.concatenate([found.by_pose[kept] for found, kept in chosen]).reshape(-1, 9)
     r = np.concatenate([found.value[kept] for found, kept in chosen]).ravel()
     return not np.linalg.norm(np.linalg.lstsq(J, r)[0][7:]) <= limit
-
-
-def _evenly(matches: Matches, count: int) -> Matches:
-    """Every so many-th match, so that so many are left."""
-    step = -(-(matches.num_points + matches.num_lines) // count)
-    return matches.take(np.arange(0, matches.num_points, step), np.arange(0, matches.num_lines, step))
