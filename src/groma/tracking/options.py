@@ -55,10 +55,12 @@ class TrackOptions:
     def make_detector(self) -> SegmentDetector:
         """Return the detector; :class:`~groma.errors.InputError` if there is none of that name.
 
-        LSD by its name works on images of half the size: it finds segments as long there, in half the time.
+        LSD by its name works on smaller images than elsewhere: it finds segments as long, in two thirds of the time.
         """
         settings: Any = {"min_length": self.min_segment_length, "max_segments": 2 * self.num_lines}
-        return LsdDetector(**settings, scale=0.5) if self.detector == "lsd" else DETECTORS.make(self.detector, **settings)
+        if self.detector == "lsd":
+            return LsdDetector(**settings, scale=self.gates.lines.detected_in)
+        return DETECTORS.make(self.detector, **settings)
 
     def __post_init__(self) -> None:
         if not (self.points or self.lines or self.planes):

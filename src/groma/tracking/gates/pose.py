@@ -111,7 +111,7 @@ class LoopGates:
 
     gap: int = gate(12, "keyframes", "keyframes between a new one and those it closes a loop with", SEQUENCES)
     compared: int = gate(25, "keyframes", "keyframes that are compared", "cost: time per keyframe")
-    voters: int = gate(100, "features", "strongest features that vote for keyframes", "cost: time per keyframe")
+    voters: int = gate(200, "features", "strongest features that vote for keyframes", "cost: time per keyframe")
     searched: int = gate(2, "keyframes", "keyframes with most votes that are matched", "cost: time per keyframe")
     min_matches: int = gate(60, "features", "features that match", SEQUENCES)
     min_inliers: int = gate(35, "features", "features that agree on a pose", SEQUENCES)
