@@ -44,18 +44,6 @@ def test_noise_is_not_followed(sigma):
     assert good.mean() < 0.02
 
 
-def test_corners_are_found_to_half_a_block_and_not_in_texture_of_single_pixels():
-    """They are looked for at half the size of the image, where such texture is even."""
-    board = np.kron(np.indices((6, 8)).sum(axis=0) % 2, np.ones((40, 40))) * 80 + 60
-    found = corners(board.astype(np.uint8), 100, 10)
-    inner = np.stack(np.meshgrid(np.arange(40.0, 320, 40), np.arange(40.0, 240, 40)), axis=-1).reshape(-1, 2)
-    away = np.linalg.norm(found[:, None] - inner, axis=2)
-    # Half of a block of five pixels, twice as large in the image, either way.
-    assert away.min(axis=0).max() < 5 * np.sqrt(2) and len(found) == len(inner)
-    fine = np.indices((240, 320)).sum(axis=0) % 2 * 40 + 100
-    assert corners(fine.astype(np.uint8), 100, 10).shape == (0, 2)
-
-
 def test_no_image_content_at_all():
     plain = np.full((120, 160), 90, np.uint8)
     assert corners(plain, 50, 8).shape == (0, 2)

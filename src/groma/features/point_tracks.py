@@ -184,21 +184,17 @@ def spread(
 
 
 def corners(image: GrayImage, count: int, distance: float) -> FloatArray:
-    """Corners (Shi and Tomasi) that noise does not explain, (N, 2) pixels, strongest first.
-
-    They are looked for in the image at half its size: what is followed is the patch around, not the corner itself.
-    """
+    """Corners (Shi and Tomasi) that noise does not explain, (N, 2) pixels, strongest first."""
     gates = POINT_TRACKS
-    small = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     everywhere: Any = None  # missing in OpenCV's types
     found, strength = cv2.goodFeaturesToTrackWithQuality(
-        small, count, gates.quality, 0.5 * distance, everywhere, blockSize=gates.block
+        image, count, gates.quality, distance, everywhere, blockSize=gates.block
     )
     if found is None:
         return np.zeros((0, 2))
     at, strength = found.reshape(-1, 2), strength.ravel()
-    noise = gates.noise_eigenvalue * image_noise(small) ** 2
-    return 2.0 * at[strength > gates.above_noise * noise].astype(np.float64) + 1.0
+    noise = gates.noise_eigenvalue * image_noise(image) ** 2
+    return at[strength > gates.above_noise * noise].astype(np.float64) + 0.5
 
 
 def image_noise(image: GrayImage) -> float:
