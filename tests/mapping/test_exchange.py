@@ -52,9 +52,7 @@ def test_names_become_parts_with_the_settings_of_the_map():
     with pytest.raises(InputError, match="needs the method detect; got object"):
         with_parts(MapOptions(detector=object()))
     assert TrackOptions(detector=Blind()).make_detector() == Blind()
-    # LSD by its name works on smaller images there; an object is taken as it is.
-    assert TrackOptions(num_lines=50).make_detector() == LsdDetector(min_length=30.0, max_segments=100, scale=0.65)
-    assert TrackOptions(detector=LsdDetector()).make_detector() == LsdDetector()
+    assert TrackOptions(num_lines=50).make_detector() == LsdDetector(min_length=30.0, max_segments=100)
 
 
 def test_finished_stages_depend_on_the_parts():

@@ -4,11 +4,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 from groma.errors import InputError
 from groma.features.contract import SegmentDetector
-from groma.features.lsd import LsdDetector
 from groma.features.registry import DETECTORS
 from groma.tracking.gates import TrackingGates
 
@@ -53,14 +51,8 @@ class TrackOptions:
     gates: TrackingGates = field(default_factory=TrackingGates)
 
     def make_detector(self) -> SegmentDetector:
-        """Return the detector; :class:`~groma.errors.InputError` if there is none of that name.
-
-        LSD by its name works on smaller images than elsewhere: it finds segments as long, in two thirds of the time.
-        """
-        settings: Any = {"min_length": self.min_segment_length, "max_segments": 2 * self.num_lines}
-        if self.detector == "lsd":
-            return LsdDetector(**settings, scale=self.gates.lines.detected_in)
-        return DETECTORS.make(self.detector, **settings)
+        """Return the detector; :class:`~groma.errors.InputError` if there is none of that name."""
+        return DETECTORS.make(self.detector, min_length=self.min_segment_length, max_segments=2 * self.num_lines)
 
     def __post_init__(self) -> None:
         if not (self.points or self.lines or self.planes):

@@ -41,7 +41,6 @@ class PointGates:
 class LineGates:
     """Lines: followed, assigned to detected segments, placed."""
 
-    detected_in: float = gate(0.65, "1", "size of the image in which LSD looks for segments", SEQUENCES)
     reduction: int = gate(2, "1", "factor by which images are reduced for the flow", "cost: time per frame")
     voters: int = gate(12, "points", "points that vote for where a segment went", SEQUENCES)
     vote_distances: tuple[float, ...] = gate((8.0, 4.0, 3.0), "px", "voters agree within, round by round", SEQUENCES)
