@@ -23,7 +23,7 @@ from groma.features.segments import MIN_LENGTH, MIN_STRENGTH, Segments
 
 @dataclass(frozen=True)
 class LsdDetector:
-    """Line segment detector (Grompone von Gioi et al., 2010) without its refinement, then fitted to the grey levels."""
+    """Line segment detector (Grompone von Gioi et al., 2010), then fitted to the grey levels."""
 
     #: Shortest segment, pixels.
     min_length: float = MIN_LENGTH
