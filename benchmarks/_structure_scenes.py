@@ -73,4 +73,5 @@ SCENES = {
     "unseen": UNSEEN,
     "buildings": _buildings(1),
     "other buildings": _buildings(2),
+    "new buildings": _buildings(3),  # run once after planes had been fitted to their members
 }
