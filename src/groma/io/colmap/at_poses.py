@@ -121,6 +121,7 @@ class PosedPhotographs:
         """Return images of the same identifiers with the points that their matches give at their poses."""
         pycolmap = load_pycolmap()
         options = pycolmap.IncrementalPipelineOptions()
+        options.max_extra_param = options.triangulation.max_extra_param = np.inf  # a given lens is not doubted
         options.num_threads = 1  # as in reconstruct_points: points must not depend on which thread is first
         for part in (options, options.mapper, options.triangulation):
             part.random_seed = self.options.seed
