@@ -5,7 +5,7 @@ Numba copies an array's description to the stack, unpacks all of it, and leaves 
 full of ``J[0, 3]`` and ``for i in range(n)``, so half of what LLVM parses and optimises, and much of what Python spends
 on making it, is that. Here only the fields that are used are read, and a range stays in registers, as does a variable
 that is assigned once. Addresses and counts are computed by the same formulas in the same blocks, so the machine code is
-the same.
+the same in nearly all functions.
 
 Numba searches its rules for each ``a + b``; here that is one instruction.
 
