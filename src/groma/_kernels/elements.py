@@ -5,7 +5,7 @@ Numba copies an array's description to the stack, unpacks all of it, and leaves 
 full of ``J[0, 3]`` and ``for i in range(n)``, so half of what LLVM parses and optimises, and much of what Python spends
 on making it, is that. Here only the fields that are used are read, and a range stays in registers, as does a variable
 that is assigned once. Addresses and counts are computed by the same formulas in the same blocks, so the machine code is
-the same.
+the same in nearly all functions.
 
 Numba searches its rules for each ``a + b``; here that is one instruction.
 
@@ -76,7 +76,7 @@ def _instruction(build: Any, op: Any, signature: Any) -> Callable[[Any, Any], An
     return partial(getattr(build, name), flags=() if is_real else ("nsw",)) if name else None
 
 
-def _assigned_before_use(blocks: dict[int, Any]) -> set[str]:
+def _assigned_before_use(blocks: Any) -> set[str]:
     """Return the variables that are assigned once, in a block through which every way to their uses leads."""
     assigned = Counter(found.target.name for block in blocks.values() for found in block.find_insts(ir.Assign))
     uses, definitions = analysis.compute_use_defs(blocks)
@@ -130,7 +130,7 @@ class _Lower(Lower):
         if self._is_plain and not identity.is_generator and not identity.code.co_exceptiontable:
             found = _assigned_before_use(self.blocks)
             self._held = {name for name in found - self._singly_assigned_vars if self._is_counted(self.typeof(name))}
-            self._singly_assigned_vars |= found - self._held
+            self._singly_assigned_vars.update(found - self._held)
 
     def loadvar(self, name: str) -> Any:
         """Return the value of a variable."""

@@ -32,7 +32,7 @@ from llvmlite import ir
 from numba.core import base, event, lowering, typeinfer, types
 from numba.core.base import BaseContext
 from numba.core.compiler_machinery import register_pass
-from numba.core.errors import new_error_context
+from numba.core.errors import new_error_context  # type: ignore[attr-defined]
 from numba.core.runtime.context import NRTContext
 from numba.core.targetconfig import TargetConfig
 from numba.core.typed_passes import NopythonTypeInference
