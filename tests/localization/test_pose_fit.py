@@ -21,6 +21,7 @@ from groma.localization.pose.matches import Matches
 from groma.localization.pose.pose_fit import fit_pose
 from groma.localization.pose.pose_problem import problem_of
 from groma.localization.pose.refinement import refine, weighed
+from groma.localization.pose.verdict import Verdict, doubted_if_other_lens
 from groma.solver.options import SolverOptions
 
 #: Ends where a step gains nothing in double precision.
@@ -131,6 +132,23 @@ def test_the_stated_deviation_of_a_focal_length_is_true():
     assert 0.6 < of_focal < 1.53
     # With 300 degrees: between 229 and 384.
     assert 2.29 < of_both < 3.84
+
+
+def test_errors_of_the_map_count_in_what_is_told_of_a_lens():
+    """A focal length that noise alone does not explain may be the one that was given, where the map is less certain."""
+    world, matches = noisy(np.random.default_rng(5), 500, 50)
+    wrong, variance, asked = scaled(1.03), 0.02**2, []
+
+    def common(found, used, each):
+        asked.append((used is matches, each))
+        return np.diag(np.repeat([0.0, variance], [6, found.points.by_pose.shape[2] - 6]))
+
+    best = refine(wrong, matches, world.pose, (50.0, 50.0))
+    plain, told = (lens_step(best, matches, (50.0, 50.0), some) for some in (None, common))
+    assert asked[0] == (True, 2)
+    assert (told.focal, told.focal_sigma**2) == pytest.approx((plain.focal, plain.focal_sigma**2 + variance))
+    right = Verdict("localized", 1.0, "")
+    assert [doubted_if_other_lens(right, step).status for step in (plain, told)] == ["uncertain", "localized"]
 
 
 def test_a_piece_that_was_moved_is_told_from_its_lens():
