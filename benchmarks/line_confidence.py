@@ -120,18 +120,20 @@ def fitted(scenes: list[Judged]) -> np.ndarray:
 
     Scenes of boxes and scenes of round bodies count alike: the latter have a fifth of the lines, and all the outlines.
     """
-    x = np.concatenate([one.evidence[one.counted] for one in scenes])
-    right = np.concatenate([one.right[one.counted] for one in scenes])
-    accuracy = np.concatenate([one.accuracy[one.counted] for one in scenes])
-    is_round = np.concatenate([np.full(one.counted.sum(), "round" in one.source.name) for one in scenes])
-    count = np.where(is_round, (~is_round).sum() / is_round.sum(), 1.0)
+    x = np.concatenate([one.evidence for one in scenes])
+    is_round = np.array(["round" in one.source.name for one in scenes])
+    lines = np.array([len(one.right) for one in scenes])
+    count = np.where(is_round, lines[~is_round].sum() / lines[is_round].sum(), 1.0)
     varies = np.ptp(x, axis=0) > 0.0
     mean, spread = np.where(varies, x.mean(0), 0.0), np.where(varies, x.std(0), 1.0)
-    rows = (x - mean) / spread
+    rows = [(one.evidence - mean) / spread for one in scenes]
 
     def cost(weights: np.ndarray) -> float:
-        p = np.clip(edge_probability(rows, weights) * accuracy, 1e-9, 1.0 - 1e-9)
-        return -(count * np.log(np.where(right, p, 1.0 - p))).sum() + 0.5 * (weights[varies] ** 2).sum()
+        total = 0.5 * (weights[varies] ** 2).sum()
+        for one, evidence, times in zip(scenes, rows, count, strict=True):
+            p = np.clip(edge_probability(evidence, weights) * one.accuracy, 1e-9, 1.0 - 1e-9)
+            total -= times * np.log(np.where(one.right, p, 1.0 - p)).sum()
+        return total
 
     weights = minimize(cost, np.ones(x.shape[1]), method="L-BFGS-B").x / spread
     for part in (TOGETHER, NO_TEXTURE):  # the first quantity of each is one

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.special import erf, erfinv
+from scipy.special import erf, erfinv, expit, logit
 
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.io.archive import read_archive, write_archive
@@ -165,6 +165,25 @@ def test_an_edge_and_texture_are_equally_likely_at_the_prominence_of_the_weights
     rows[:, -1] = limit + np.array([0.0, 20.0, -20.0])
     at, far, below = edge_probability(rows, weights)
     assert at == pytest.approx(0.5 * far) and below < 1e-12
+
+
+def test_the_lines_of_a_scene_tell_the_share_that_has_an_edge():
+    weights = np.array(list(WEIGHTS.values()))
+
+    def probability(*likelihood):  # logarithms of ratios; no line is texture
+        rows = np.zeros((len(likelihood), len(WEIGHTS)))
+        rows[:, TOGETHER.start], rows[:, -1] = np.array(likelihood) / weights[TOGETHER.start], 50.0
+        return edge_probability(rows, weights)
+
+    for doubtful in ([0.5], [0.5] * 300, [0.5, *[9.0] * 100], [0.5, *[-9.0] * 100]):
+        found = probability(*doubtful)
+        share = (0.5 * GATES.prior_lines + found.sum()) / (GATES.prior_lines + len(found))
+        np.testing.assert_allclose(found, expit(np.array(doubtful) + logit(share)), rtol=1e-9)
+    alone, clean, few = (probability(0.5, *others)[0] for others in ((), [9.0] * 100, [-9.0] * 100))
+    assert few < alone - 0.3 and alone == pytest.approx(expit(0.5), abs=0.01) and clean > alone + 0.2
+    assert probability(*np.zeros(1000)) == pytest.approx(0.5)  # what says nothing moves nothing
+    assert len(probability()) == 0
+    assert np.isfinite(probability(*[800.0] * 5, *[-800.0] * 5)).all()
 
 
 def test_residuals_are_told_in_pixels_whatever_the_standard_deviations_say(scene):

@@ -4,19 +4,22 @@ r"""How probable it is that a line is right, from what its observations say.
 A line is called right where an edge of the object runs along it, at least along half of it, within 2.5 thousandths of
 the usual distance of lines from their cameras. Four things must be true of it:
 
-.. math:: p = \frac{1}{1 + \exp(-w_0 - \sum_k w_k x_k)}\; \frac{1}{1 + \exp(-w_s - w_t x_t)}\;
+.. math:: p = \frac{1}{1 + \exp(-w_0 - \sum_k w_k x_k - b)}\; \frac{1}{1 + \exp(-w_s - w_t x_t)}\;
           \operatorname{erf}\frac{\tau}{\sqrt 2\, u}\; \operatorname{erf}\frac{1}{\sqrt 2\, r}.
 
 The first factor, that its segments belong together, is a logistic model of five quantities (:func:`line_evidence`).
 The outline of a round body is no edge, and moves with the view: its segments drift from any line that stands still, and
-images that show the body beside it do not show it where others do. The second, that they are no texture, is one of the
-prominence alone: contrast (:mod:`groma.features.contrast`) times relative length, since texture has stripes of the same
-contrast beside it, and its stripes are short. Where views agree on texture, as they do on stripes of a wall, only this
-factor tells. The third is the probability of a normal error within :math:`\tau = 0.0025`, where u is the standard
-deviation across the line that half of its places do not exceed, over the usual distance. Segments and the planes that
-the line lies on tell it together: of an edge that all images see from one height, planes know the depth. The fourth is
-the share of normal residuals of r pixels root mean square within the width of an edge, a pixel: chords of curves fit no
-single line, and where segments of a curve are bowed their standard deviations, and with them r, say so.
+images that show the body beside it do not show it where others do. How many lines of a scene have an edge is not known
+beforehand: nearly all of a plain box, few of an upholstered chair. Their share :math:`\pi`, of log odds b, is estimated
+from the lines themselves, with a prior of m lines of which half have one (:func:`edge_probability`). The second, that
+they are no texture, is one of the prominence alone: contrast (:mod:`groma.features.contrast`) times relative length,
+since texture has stripes of the same contrast beside it, and its stripes are short. Where views agree on texture, as
+they do on stripes of a wall, only this factor tells. The third is the probability of a normal error within
+:math:`\tau = 0.0025`, where u is the standard deviation across the line that half of its places do not exceed, over the
+usual distance. Segments and the planes that the line lies on tell it together: of an edge that all images see from one
+height, planes know the depth. The fourth is the share of normal residuals of r pixels root mean square within the width
+of an edge, a pixel: chords of curves fit no single line, and where segments of a curve are bowed their standard
+deviations, and with them r, say so.
 
 No quantity depends on the unit of length or on how many pixels an image has. The weights were fitted on rendered scenes
 of boxes and round bodies whose edges are known exactly, and the probabilities compared with those of other scenes
@@ -50,8 +53,8 @@ from groma.scene import Scene
 
 #: The quantities, and the weight of each as ``benchmarks/line_confidence.py`` found it.
 WEIGHTS: dict[str, float] = {
-    "constant": 4.235, "spread": 1.032, "support": 1.689, "beside": 1.115, "residual": -1.007, "drift": -1.835,
-    "texture": -4.327, "prominence": 3.249,
+    "constant": 2.619, "spread": 1.194, "support": 1.656, "beside": 0.971, "residual": -1.134, "drift": -1.461,
+    "texture": -4.219, "prominence": 3.240,
 }  # fmt: skip
 
 
@@ -60,6 +63,10 @@ class ConfidenceGates:
     """What a line must be within to be right."""
 
     tolerance: float = gate(0.0025, "1", "error of a right line over the distance", "convention: two pixels")
+    prior_lines: float = gate(
+        30.0, "lines", "that the prior on the share of lines with an edge counts for",
+        "chosen on the scenes of the fit, each left out in turn",
+    )  # fmt: skip
     edge_px: float = gate(SEGMENTS.edge, "px", "residual of a segment of a right line", "derived from an edge's width")
     usual_contrast: float = gate(30.0, "1", "of segments whose contrast is unknown", "chosen on the scenes of the fit")
 
@@ -69,6 +76,8 @@ GATES = ConfidenceGates()
 DEFAULT_CONFIDENCE = 0.5
 #: Quantities of the two logistic models; the first of each is 1.
 TOGETHER, NO_TEXTURE = slice(0, 6), slice(6, 8)
+#: Largest logarithm of the odds of an edge, and how often the interval is halved in which they lie (cost: time).
+_MOST_ODDS, _HALVINGS = 40.0, 50
 #: Smallest misfit and spread, below which they say nothing more.
 _MIN_MISFIT, _MIN_SPREAD = 0.3, 1e-4
 #: Shares of an information below which it is none: that of a line, and of the radius beside it (convention: rounding).
@@ -91,9 +100,22 @@ def line_confidence(scene: Scene, surface_px: float = SURFACE_SIGMA_PX) -> Float
 
 
 def edge_probability(evidence: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the probability (L,) that there is an edge, from what :func:`line_evidence` returns and its weights."""
+    r"""Return the probability (L,) that there is an edge, from what :func:`line_evidence` returns and its weights.
+
+    The lines are all those of a scene. Weights are of log likelihood ratios z: the share of lines with an edge solves
+
+    .. math:: (n + m)\, \pi = \tfrac m2 + \sum_i \frac{1}{1 + \exp(-z_i - b)}, \qquad b = \log\frac{\pi}{1 - \pi},
+
+    the fixed point of expectation maximisation, of which there is one.
+    """
     together, no_texture = (evidence[:, part] @ weights[part] for part in (TOGETHER, NO_TEXTURE))
-    return np.asarray(scipy.special.expit(together) * scipy.special.expit(no_texture))
+    low, high, expit = -_MOST_ODDS, _MOST_ODDS, scipy.special.expit
+    for _ in range(_HALVINGS):
+        odds = 0.5 * (low + high)
+        expected = 0.5 * GATES.prior_lines + expit(together + odds).sum()
+        more = expected > (len(together) + GATES.prior_lines) * expit(odds)
+        low, high = (odds, high) if more else (low, odds)
+    return np.asarray(expit(together + low) * expit(no_texture))
 
 
 def line_accuracy(
