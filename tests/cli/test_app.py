@@ -96,6 +96,7 @@ def test_an_empty_name_is_not_the_folder_one_is_in(arguments, where, capsys, tmp
     [
         (["merge", "/", "b", "-o", "out"], "/ holds no COLMAP model"),
         (["merge", "text.txt", "b", "-o", "out"], "text.txt is not a scene"),
+        (["merge", "b", "./b", "-o", "out"], "A and B are the same map, b"),
         (["adjust", "empty"], "; it is empty."),
         (["adjust", "b", "-o", "text.txt/out"], "text.txt is a file. Choose another place."),
         (["evaluate", "trajectory", "b", "text.txt"], "Cannot read b: it is a folder. Pass the file in it."),

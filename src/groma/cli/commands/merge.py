@@ -10,6 +10,7 @@ import typer
 from groma._counted import counted
 from groma.cli.shared import options as _options
 from groma.cli.shared.console import Console
+from groma.errors import InputError
 
 
 def merge(
@@ -43,6 +44,8 @@ def merge(
 
     _output.check_outputs(force, output, json_target=console.json_target)
     check_inputs(first, second, first_images, second_images)
+    if first.samefile(second):
+        raise InputError(f"A and B are the same map, {first}. Give two maps.")
 
     from groma.cli.shared.diagnosis import try_diagnosis
     from groma.cli.shared.extending import merge_maps
