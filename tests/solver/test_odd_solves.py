@@ -26,6 +26,16 @@ def test_empty_problem_and_everything_constant():
     assert solve(problem).report.termination is Termination.NOTHING_TO_DO
 
 
+def test_held_variables_keep_their_last_bits():
+    """A step of zero rounds a quaternion that is of unit length up to rounding."""
+    problem = scene_problem(num_cameras=60, num_points=120)
+    poses, held = problem.variables["poses"], np.arange(60) % 3 > 0
+    variables = {**problem.variables, "poses": dataclasses.replace(poses, constant=held)}
+    found = solve(Problem(variables, problem.factors)).problem.variables["poses"].state
+    assert np.array_equal(found[held], poses.state[held])
+    assert (found[~held] != poses.state[~held]).any(axis=1).all()
+
+
 def test_empty_groups_are_ignored():
     problem = scene_problem(num_points=20)
     empty = problem.factors[0].take(np.zeros(0, dtype=int))

@@ -12,12 +12,9 @@ from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.features import Features, describe
 from groma.tracking.frame.measurements import Measurements
 from groma.tracking.map.culling import drop_unseen
-from groma.tracking.map.keyframes import Followed
 from groma.tracking.map.landmarks import ALIVE
-from groma.tracking.map.lines import FollowedSegments
 from groma.tracking.map.points import PointTracks, find_again
 from groma.tracking.map.track_map import Keyframe, TrackMap
-from groma.tracking.pose.following import follow_frame
 from groma.tracking.pose.verification import PoseVerification, misses_much
 from groma.tracking.stopwatch import Stopwatch
 
@@ -120,8 +117,7 @@ def test_points_that_are_not_found_are_looked_for_ever_more_rarely(monkeypatch):
     asked = []
 
     def follow(_before, _now, _pixels, guesses, levels):
-        """Only the first is ever found; where they are expected is known to less than the width of a patch."""
-        assert levels == 0
+        """Only the first is ever found."""
         asked.append(len(guesses))
         return guesses, guesses[:, 0] < 100
 
@@ -133,32 +129,6 @@ def test_points_that_are_not_found_are_looked_for_ever_more_rarely(monkeypatch):
     assert track_map.points.misses.tolist() == [0, 13, 13]
     drop_unseen(track_map, gates.max_misses)
     assert track_map.points.alive.tolist() == [True, False, False]
-
-
-def test_a_part_of_the_points_is_followed_after_a_search(monkeypatch):
-    """They tell whether most points are gone again; without a search all are followed."""
-    counts, surprised = [], [False] * 3 + [True] * 9
-
-    def follow(track_map, before, data, followed, *more):
-        counts.append((more[-1], len(followed.points)))
-        return follow_frame(track_map, before, data, followed, *more)
-
-    monkeypatch.setattr("groma.tracking.tracker.follow_frame", follow)
-    monkeypatch.setattr(PoseVerification, "is_surprised", lambda self, *_: surprised[len(counts)])
-    tracker, few = Tracker(_room.camera(), OPTIONS), OPTIONS.gates.lines.few_points
-    for frame in _room.frames("rgbd", _room.poses(9)):
-        tracker.process(frame)
-    tracker.finish()
-    assert max(count for searched, count in counts if not searched) > few
-    assert [count for searched, count in counts if searched] == [few] * 5
-
-
-def test_a_sample_of_what_is_followed_is_spread_evenly():
-    tracks = PointTracks(np.arange(10), np.zeros((10, 2)))
-    followed = Followed(tracks, FollowedSegments.empty())
-    assert followed.sample(4).points.index.tolist() == [0, 3, 6, 9]
-    assert followed.sample(20).points.index.tolist() == list(range(10))
-    assert len(Followed.nothing().sample(4).points) == 0
 
 
 def test_a_pose_that_most_points_do_not_agree_with_is_in_doubt():

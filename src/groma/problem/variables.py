@@ -79,6 +79,11 @@ class Variables:
     def _ambient(self) -> FloatArray:
         return self.manifold.ambient(self.state)
 
+    def held_kept(self, state: FloatArray) -> FloatArray:
+        """Return what a solve found, with held variables as they were: a step of zero rounds those of unit length."""
+        free = self.free_coordinates()
+        return state if free is None else np.where(free.any(axis=1, keepdims=True), state, self.state)
+
     def with_state(self, state: FloatArray) -> Variables:
         """Return the same group at another state."""
         return dataclasses.replace(self, state=state)

@@ -108,7 +108,10 @@ def solve(
         workers.close()
     warn_of_oddities(report)
     report.seconds["total"] = watch.elapsed()
-    return Solution(problem.with_states(parts.join(to_original_order(layout, states))), report)
+    found = parts.join(to_original_order(layout, states)).items()
+    return Solution(
+        problem.with_states({name: problem.variables[name].held_kept(state) for name, state in found}), report
+    )
 
 
 def minimise(

@@ -216,17 +216,15 @@ class Tracker:
         assert present.data is not None
         with watch("turn"):
             predicted, prior_sigma = self._with_turn(data, predicted, prior_sigma)
-        # After a search a part of the points tells whether most are gone again; if not, the others are found again.
-        before = present.followed.sample(self.options.gates.lines.few_points) if self._searched else present.followed
         estimate, followed = follow_frame(
-            self.map, present.data, data, before, present.pose, (predicted, prior_sigma), watch,
+            self.map, present.data, data, present.followed, present.pose, (predicted, prior_sigma), watch,
             self._mapper.frame_pool, self._searched,
         )  # fmt: skip
         if estimate is None:
             return Attempt(predicted, prior_sigma, followed=followed)
         trusted = self._verification.trusts(self.map, data, estimate)
         doubt = not trusted or self._verification.is_surprised(estimate, predicted, prior_sigma) or misses_much(
-            self.map, self.camera, before.points, estimate.pose, estimate.counts["points"], self.options.gates
+            self.map, self.camera, present.followed.points, estimate.pose, estimate.counts["points"], self.options.gates
         )  # fmt: skip
         return Attempt(predicted, prior_sigma, *(None, estimate) if doubt else (estimate, None), trusted, followed)
 

@@ -125,7 +125,9 @@ def solve_shards(
     report.num_factors, report.num_residuals = problem.num_factors, problem.num_residuals
     report.seconds["total"] = watch.elapsed()
     states = problem.states
-    return ShardedSolution({name: group.with_state(states[name]) for name, group in variables.items()}, report)
+    return ShardedSolution(
+        {name: group.with_state(group.held_kept(states[name])) for name, group in variables.items()}, report
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

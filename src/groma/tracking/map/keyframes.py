@@ -38,11 +38,6 @@ class Followed:
         """Return nothing."""
         return Followed(PointTracks.empty(), FollowedSegments.empty())
 
-    def sample(self, count: int) -> Followed:
-        """Return so many of the points, evenly among them, and all lines."""
-        rows = np.linspace(0, len(self.points) - 1, min(count, len(self.points))).astype(np.int64)
-        return Followed(self.points.take(rows), self.lines)
-
 
 def wants_keyframe(
     track_map: TrackMap, pose: FloatArray, followed: Followed, frames_since: int, options: TrackOptions

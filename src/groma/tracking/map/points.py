@@ -103,8 +103,7 @@ def find_again(
         of = of[due]
         patch = track_map.keyframes[index].gray
         assert patch is not None
-        # The patch of 15 px reaches as far as they may be from where they are expected.
-        there, good = follow(patch, now, points.pixel[rows[of]], pixel[of], levels=0)
+        there, good = follow(patch, now, points.pixel[rows[of]], pixel[of], levels=1)
         good &= np.linalg.norm(there - pixel[of], axis=1) < gates.again_radius
         points.misses[rows[of[~good]]] += 1
         points.misses[rows[of[good]]] = 0
