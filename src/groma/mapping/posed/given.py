@@ -78,8 +78,10 @@ def in_pixels_of(scene: Scene, images: Path) -> tuple[Scene, tuple[str, ...]]:
     of_image = np.array([size_of_image(images, name) for name in scene.images.names], float).reshape(-1, 2)
     was = np.stack([scene.cameras.width, scene.cameras.height], axis=1)
     scale, params = np.ones(was.shape), scene.cameras.params.copy()
-    for row, size in enumerate(was):
-        found = np.unique(of_image[(scene.images.camera_idx == row) & of_image.all(axis=1)], axis=0)
+    order = np.argsort(scene.images.camera_idx, kind="stable")
+    of_camera = np.split(of_image[order], np.cumsum(np.bincount(scene.images.camera_idx, minlength=len(was)))[:-1])
+    for row, (size, sizes) in enumerate(zip(was, of_camera, strict=True)):
+        found = np.unique(sizes[sizes.all(axis=1)], axis=0)
         model = camera_models.model(scene.cameras.models[row])
         center = list(model.principal_point_indices)  # panoramas have none
         # derived: width and height are each off by less than a pixel
