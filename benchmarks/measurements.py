@@ -34,7 +34,8 @@ from groma.adjustment.survey.reliability import reliability
 from groma.geometry import quaternion
 from groma.io import read_scene
 from groma.io.survey import CoordinateSystem, Places
-from groma.mapping.surveyed import adjust_surveyed, weighted
+from groma.mapping.noise.weighted import weighted
+from groma.mapping.surveyed import adjust_surveyed
 from groma.scene import (
     CameraPositions,
     Cameras,

@@ -13,7 +13,6 @@ from typing import Any
 
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult, Progress
-from groma.adjustment.rolling_shutter import GATES as SETTLING
 from groma.adjustment.rolling_shutter import Motions, adjust_rolling_shutter, motions_of
 from groma.adjustment.survey.attach import Survey, Surveyed, with_survey
 from groma.adjustment.survey.given_poses import given_poses_of
@@ -22,7 +21,7 @@ from groma.adjustment.survey.records import Reliability
 from groma.io.survey import WorldFrame
 from groma.mapping.checkpoint_files import SCENE
 from groma.mapping.checkpoints import stage
-from groma.mapping.noise.observations import noise_px
+from groma.mapping.noise.weighted import adjust_weighted, weighted
 from groma.scene import Scene, Similarity
 from groma.scene.checks import check_scene_given
 from groma.scene.local_frame import usual_frame
@@ -88,15 +87,7 @@ def adjust_surveyed(
     surveyed = with_survey(scene, survey) if survey else replace(unmoved, scene=scene)
     if keep_suspects:
         surveyed = replace(surveyed, scene=with_rejected(surveyed.scene, ()))
-    chosen = weighted(surveyed.scene, options or AdjustOptions())
-    result = adjust(surveyed.scene, chosen, progress)
-    for _ in range(SETTLING.max_rounds - 1):
-        better = weighted(result.scene, chosen)
-        ratio = better.point_sigma_px / chosen.point_sigma_px
-        if 1.0 / SETTLING.settled <= ratio <= SETTLING.settled:
-            break
-        chosen = better
-        result = adjust(surveyed.scene, chosen, progress)
+    result, chosen = adjust_weighted(surveyed.scene, options, progress)
     if keep_suspects:
         found = reliability_of(result.scene, result.problem)
     else:
@@ -139,13 +130,3 @@ def adjust_with_survey(points: Scene, options: Any, say: Callable[[str, int, int
     if options.keep_suspects:
         return adjust(with_rejected(points, ()), told, tell).scene
     return without_gross_errors(adjust(points, told, tell), lambda scene: adjust(scene, told, tell))[0].scene
-
-
-def weighted(scene: Scene, options: AdjustOptions) -> AdjustOptions:
-    """Return the options with the noise that the observations of a scene show."""
-    sigma = {}
-    if options.points and scene.num_point_observations:
-        sigma["point_sigma_px"] = noise_px(scene, "points")
-    if options.lines and scene.num_line_observations:
-        sigma["line_sigma_px"] = noise_px(scene, "lines")
-    return replace(options, **sigma)

@@ -33,6 +33,12 @@ def num_relations(scene: "Scene") -> dict[str, int]:
     return {kind: count for kind, count in counts.items() if count}
 
 
+def has_weights(scene: "Scene") -> bool:
+    """Whether observations in images have different standard deviations, relative to a common one."""
+    tables = scene.point_observations.sigma, scene.line_observations.sigma
+    return any(len(sigma) > 0 and sigma.min() < sigma.max() for sigma in tables)
+
+
 def measurements_of(scene: "Scene") -> dict[str, int]:
     """Number of measurements besides those of points and lines in images, by kind; only kinds that there are."""
     counts = {

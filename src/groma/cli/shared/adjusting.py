@@ -59,8 +59,8 @@ class Wanted:
     sigma0: Annotated[
         float,
         RESULTS.option(
-            "With --covariance: the measurement noise in units of the stated one (1 pixel unless the scene has "
-            "standard deviations).",
+            "With --covariance: the measurement noise in units of the assumed one: 1 pixel; where observations have "
+            "weights, as in maps, what their residuals show.",
             metavar="S",
         ),
     ] = 1.0
@@ -127,7 +127,7 @@ def adjust_and_write(
     true = None if wanted.truth is None else read_scene(wanted.truth)
     console.expect_compilation(_work_of(before, options))
     with compilation_time() as compilation, console.progress() as progress:
-        before, result, survey, motions = _adjusted(before, options, wanted, measured, progress)
+        before, result, options, survey, motions = _adjusted(before, options, wanted, measured, progress)
     entries = ()
     if wanted.contributions:
         from groma.adjustment.contributions import contributions  # with evaluation, half a second to import
@@ -223,9 +223,10 @@ def _adjusted(
     wanted: Wanted,
     measured: Measured,
     progress: Callable[[Progress], bool | None],
-) -> tuple[Scene, AdjustResult, dict[str, Any] | None, Motions | None]:
-    """Return the initial scene, the result, and the numbers of measurements and camera motions."""
+) -> tuple[Scene, AdjustResult, AdjustOptions, dict[str, Any] | None, Motions | None]:
+    """Return the initial scene, the result, how it was weighted, and the numbers of measurements and camera motions."""
     from groma.adjustment.adjust import adjust
+    from groma.scene.counts import has_weights
 
     surveyed = bool(measured) or before.has_survey
     for option, given in (("--protocol", wanted.protocol), ("--keep-suspects", measured.keep_suspects or None)):
@@ -238,12 +239,16 @@ def _adjusted(
 
         before = with_rolling_shutter(before, wanted.rolling_shutter)
     if not surveyed and not len(before.camera_motions):
-        return before, adjust(before, options, progress), None, None
+        if before.is_metric or not has_weights(before):
+            return before, adjust(before, options, progress), options, None, None
+        from groma.mapping.noise.weighted import adjust_weighted
+
+        return before, *adjust_weighted(before, options, progress), None, None
     from groma.mapping.surveyed import adjust_surveyed  # with what finds noise in images
 
     survey = measured.read(None, lambda: before.images.names) if measured else None
     found = adjust_surveyed(before, survey, options, progress, measured.keep_suspects)
-    return found.surveyed.scene, found.result, found.to_dict() if surveyed else None, found.motions
+    return found.surveyed.scene, found.result, options, found.to_dict() if surveyed else None, found.motions
 
 
 def why_no_covariances(scene: Scene, path: Path) -> list[str]:
