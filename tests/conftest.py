@@ -5,6 +5,7 @@ Compiled kernels go to a folder of the checkout rather than beside the sources. 
 (:mod:`groma._kernels.cache`). The variable is set before Numba is imported, which reads it then.
 """
 
+import gc
 import os
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ os.environ.setdefault("NUMBA_CACHE_DIR", str(ROOT / ".cache" / "numba"))
 if "PYTEST_XDIST_WORKER" in os.environ:  # it keeps a core busy by itself
     os.environ |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
 os.environ.setdefault("GROMA_COMPILE_PROCESSES", "0")
+gc.disable()  # nothing goes away while tests are collected; looking for it took a quarter of that time
 #: Folders whose files take long, so that no worker is left with one of them at the end of a run.
 LONG = ("tracking", "hostile", "mapping", "viz", "localization", "cli", "adjustment")
 
@@ -61,6 +63,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if "shared" in item.keywords:
             item.add_marker(skip)
+
+
+def pytest_collection_finish() -> None:
+    """Look no more through what is there now and stays."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")
