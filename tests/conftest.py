@@ -21,7 +21,6 @@ os.environ.setdefault("NUMBA_CACHE_DIR", str(ROOT / ".cache" / "numba"))
 if "PYTEST_XDIST_WORKER" in os.environ:  # it keeps a core busy by itself
     os.environ |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
 os.environ.setdefault("GROMA_COMPILE_PROCESSES", "0")
-gc.disable()  # nothing goes away while tests are collected; looking for it took a quarter of that time
 #: Folders whose files take long, so that no worker is left with one of them at the end of a run.
 LONG = ("tracking", "hostile", "mapping", "viz", "localization", "cli", "adjustment")
 
@@ -46,6 +45,17 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     return LoadFileScheduling(config, log) if config.getvalue("dist") == "load" else None
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Any:
+    """Nothing goes away while tests are collected, and it stays: to look for it took a quarter of that time."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
+
+
 def _long_first(item: pytest.Item) -> tuple[int, int]:
     folder = item.path.parent.name
     return ("shared" not in item.keywords, LONG.index(folder) if folder in LONG else len(LONG))
@@ -63,12 +73,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if "shared" in item.keywords:
             item.add_marker(skip)
-
-
-def pytest_collection_finish() -> None:
-    """Look no more through what is there now and stays."""
-    gc.freeze()
-    gc.enable()
 
 
 @pytest.fixture(scope="session")
