@@ -50,6 +50,8 @@ autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 autodoc_default_options = {"show-inheritance": True}
 autodoc_preserve_defaults = True
+# There are none; looking for them parses the source of every function.
+autodoc_use_type_comments = False
 # Signatures say FloatArray and not what that is made of.
 autodoc_type_aliases = {name: name for name in ("BoolArray", "FloatArray", "IntArray")}
 # Words in the prose of a parameter's type ("name", "kind") are looked up as if they were types; more than one class has

@@ -9,6 +9,7 @@ import re
 import runpy
 import tomllib
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -20,13 +21,17 @@ MODULES = {
     for path in sorted((SOURCES / "groma").rglob("*.py"))
 }
 PACKAGES = sorted(name for name, path in MODULES.items() if path.name == "__init__.py")
-TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in MODULES.items()}
 
 MAX_FILES, MAX_LINES, MAX_FUNCTION = 20, 400, 80
 #: Files of more lines than allowed, functions of more lines, and underscores that another package imports.
 LONG_MODULES: set[str] = set()
 LONG_FUNCTIONS: set[str] = set()
 BORROWED: set[tuple[str, str]] = set()
+
+
+@cache
+def trees() -> dict[str, ast.Module]:
+    return {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in MODULES.items()}
 
 
 def imported(tree: ast.AST) -> Iterator[str]:
@@ -71,7 +76,7 @@ def functions(tree: ast.AST, signature: bool = True, prefix: str = "") -> Iterat
 
 def test_an_underscore_stays_in_its_package():
     borrowed = set()
-    for module, tree in TREES.items():
+    for module, tree in trees().items():
         for name in imported(tree):
             owner = owner_of(name)
             if owner is not None and module != owner and not module.startswith(f"{owner}."):
@@ -94,8 +99,8 @@ def imported_when_run(node: ast.AST) -> Iterator[str]:
 
 
 def test_files_do_not_import_each_other_in_circles():
-    imports = {module: {*imported_when_run(tree)} - {module} for module, tree in TREES.items()}
-    modules = {m: {n if n in TREES else n.rpartition(".")[0] for n in names} for m, names in imports.items()}
+    imports = {module: {*imported_when_run(tree)} - {module} for module, tree in trees().items()}
+    modules = {m: {n if n in MODULES else n.rpartition(".")[0] for n in names} for m, names in imports.items()}
     while done := [module for module, names in modules.items() if not names & modules.keys() - {module}]:
         modules = {module: names for module, names in modules.items() if module not in done}
     assert sorted(modules) == []
@@ -109,7 +114,7 @@ def test_names_are_listed_where_they_are_supported():
     rooms = runpy.run_path(str(ROOT / "docs" / "_supported_names.py"))["ROOMS"]
     supported = {module for _, modules in rooms for module, names in modules.items() if names is None}
     listing = set()
-    for module, tree in TREES.items():
+    for module, tree in trees().items():
         lists = [
             node for node in tree.body if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__"
         ]
@@ -135,7 +140,7 @@ def test_functions_are_short():
     """Of commands the list of options does not count: it is the manual."""
     long = {
         f"{module}.{name}"
-        for module, tree in TREES.items()
+        for module, tree in trees().items()
         for name, lines in functions(tree, signature=not module.startswith("groma.cli.commands."))
         if lines > MAX_FUNCTION
     }
@@ -145,7 +150,7 @@ def test_functions_are_short():
 @pytest.mark.parametrize("room", PACKAGES)
 def test_rooms_are_small_and_say_what_they_are(room):
     assert len(list(MODULES[room].parent.glob("*.py"))) <= MAX_FILES
-    assert ast.get_docstring(TREES[room])
+    assert ast.get_docstring(trees()[room])
 
 
 def test_files_that_are_spoken_of_exist():
@@ -153,7 +158,7 @@ def test_files_that_are_spoken_of_exist():
     plan = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
     found = [(ROOT, name) for name in re.findall(r"`([\w./]+/[\w./]*|[\w/]+\.py)`", plan)]
     for room in PACKAGES:
-        said = ast.get_docstring(TREES[room]) or ""
+        said = ast.get_docstring(trees()[room]) or ""
         found += [(MODULES[room].parent, name) for name in re.findall(r"``([\w/]+\.py)``", said)]
     known = {path.relative_to(SOURCES).as_posix() for path in (SOURCES / "groma").rglob("*")}
     missing = [

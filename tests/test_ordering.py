@@ -67,6 +67,7 @@ def made_here(function):
                     yield ast.unparse(name)
 
 
+@pytest.mark.compiled
 def test_compiled_loops_do_without_what_takes_long_to_compile():
     """Sorting and medians of NumPy, and rows copied by ``a[:] = b``: groma._ordering has short ones."""
     found = []

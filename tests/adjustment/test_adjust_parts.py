@@ -94,6 +94,7 @@ def test_intrinsics_are_estimated_if_asked(scene, tmp_path):
 
 
 @pytest.mark.parametrize("refine", [False, True])
+@pytest.mark.compiled
 def test_a_calibration_that_was_not_given_is_held_and_that_is_said(scene, tmp_path, refine):
     paths = write_parts(near_the_middle(scene.points_only()), tmp_path / "parts", observations=200)
     result = adjust_parts(paths, tmp_path / "out", options=OPTIONS, refine_intrinsics=refine)

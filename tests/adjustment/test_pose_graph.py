@@ -88,6 +88,7 @@ def lattice(rng, side, noise):
     return PoseGraph(GraphPoses(np.arange(count), truth), Motions(first, second, motion, information))
 
 
+@pytest.mark.compiled
 def test_noisy_turns_end_in_the_minimum_of_the_truth(rng):
     """Errors of 0.25 rad add up along a chain of motions to half a turn: only all motions together lead back."""
     graph = lattice(rng, 16, 0.25)
@@ -175,6 +176,7 @@ def test_damping_does_not_hold_back_a_long_chain(monkeypatch):
     assert now.final_cost <= before.final_cost
 
 
+@pytest.mark.compiled
 def test_a_wrong_motion_loses(rng):
     _, graph = ring(rng, count=30, noise=0.01)
     motions = graph.motions

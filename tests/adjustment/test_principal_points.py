@@ -112,6 +112,7 @@ def test_what_is_not_asked_for_stays():
 
 
 @pytest.mark.kernels
+@pytest.mark.compiled
 def test_they_are_found_where_cameras_look_in_many_directions():
     for seed in range(3):
         _, start, lens = _around(seed)
@@ -126,6 +127,7 @@ def test_they_are_found_where_cameras_look_in_many_directions():
 
 
 @pytest.mark.kernels
+@pytest.mark.compiled
 def test_deviations_hold_the_errors_of_an_estimated_calibration():
     """Over draws of lenses: squared errors are as large as stated; with the middle held they are many times that."""
     ratios = []
@@ -141,6 +143,7 @@ def test_deviations_hold_the_errors_of_an_estimated_calibration():
 
 
 @pytest.mark.kernels
+@pytest.mark.compiled
 def test_one_direction_of_view_leaves_them_where_they_are_expected():
     for seed in range(4):
         _, start, lens = _one_direction(seed)
@@ -157,6 +160,7 @@ def test_one_direction_of_view_leaves_them_where_they_are_expected():
 
 
 @pytest.mark.kernels
+@pytest.mark.compiled
 def test_what_is_known_of_lenses_does_not_grow_with_the_noise():
     _, start, _ = _one_direction(5)
     found = groma.adjust(start, groma.AdjustOptions(**LEAST_SQUARES))
@@ -171,6 +175,7 @@ def test_what_is_known_of_lenses_does_not_grow_with_the_noise():
 
 
 @pytest.mark.kernels
+@pytest.mark.compiled
 def test_leaving_out_landmarks_keeps_what_is_known_without_them():
     _, start, _ = _one_direction(9)
     found = groma.adjust(start, groma.AdjustOptions(**LEAST_SQUARES))

@@ -2,6 +2,7 @@
 """Errors of the poses and calibrations of a map: what they are, that queries know of them, and where none are told."""
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -66,6 +67,7 @@ class _Map:
         return error @ np.linalg.solve(covariance, error) / 6.0
 
 
+@cache
 def _map(seed, num_images=8, is_unknown=False):
     rng = np.random.default_rng(seed)
     truth = holistic(num_images, seed, noise_px=0.0).truth.keep(planes=[], directions=[]).replace(relations=Relations())
@@ -113,6 +115,7 @@ def _map(seed, num_images=8, is_unknown=False):
 
 
 @pytest.mark.kernels
+@pytest.mark.compiled
 @pytest.mark.parametrize("calibration", ["that of the map", "that of the map, not given", "its own", "unknown"])
 def test_queries_are_as_uncertain_as_the_map(calibration):
     """Squared errors of six degrees: 24 queries have a mean of 1 with a standard deviation of 0.12; without the errors

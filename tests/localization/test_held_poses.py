@@ -47,6 +47,7 @@ def _world(seed, errors):
 
 
 @pytest.mark.kernels
+@pytest.mark.compiled
 def test_their_size_is_found():
     """Variances of seven poses are good to a quarter, their mean of 16 maps to 6 %."""
     found = []
@@ -72,6 +73,7 @@ def test_exact_poses_are_exact():
 
 
 @pytest.mark.kernels
+@pytest.mark.compiled
 def test_queries_are_as_uncertain_as_the_poses():
     """Squared errors of six degrees: 24 queries have a mean of 1 with a standard deviation of 0.12, and of 0.2 with
     variances from seven poses each; without errors of poses they are told to be far better than they are.

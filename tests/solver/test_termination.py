@@ -47,6 +47,7 @@ def test_what_is_left_after_convergence_is_less_than_the_tolerance(seed):
 
 
 @pytest.mark.kernels
+@pytest.mark.compiled
 def test_the_last_step_goes_where_the_cost_cannot_tell():
     """From two starts the same states to the rounding of the gradient, which the cost knows to half of its digits."""
     problem = scene_problem(num_cameras=6, num_points=60, num_lines=8, noise=1.0, disturb=0.01)
