@@ -124,6 +124,21 @@ def test_loops_are_vectorised_only_where_it_is_said(tmp_path, monkeypatch):
     assert ["x double>" in text for text in texts] == [False, True]
 
 
+def test_a_kernel_called_with_two_constants_is_compiled_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+
+    @kernel
+    def power(x, exponent):
+        return x if exponent == 1 else x * x
+
+    @loop
+    def both(x):
+        return power(x, 1) + power(x, 2)
+
+    assert both(3.0) == 12.0
+    assert [*power.overloads] == [(numba.float64, numba.int64)]
+
+
 def test_functions_of_numba_alone_between(pair):
     """They call kernels, and are called by loops."""
     weighted, _ = pair

@@ -37,6 +37,7 @@ from numba.core.targetconfig import ConfigStack
 from numba.core.typed_passes import NativeLowering as NumbaLowering
 from numba.core.typed_passes import NopythonRewrites as NumbaRewrites
 from numba.core.typed_passes import NopythonTypeInference
+from numba.core.types import unliteral
 from numba.core.typing.templates import _OverloadFunctionTemplate
 from numba.core.untyped_passes import InlineClosureLikes as NumbaInlineClosureLikes
 
@@ -44,6 +45,7 @@ from groma._kernels.digest import dependence
 from groma._kernels.elements import NativeLowering
 from groma._kernels.lifetimes import on_demand
 from groma._kernels.loading import rebuilt
+from groma._kernels.parts import is_versioned, module_of
 from groma._kernels.rewrites import InlineClosureLikes, NopythonRewrites
 from groma._kernels.shortcuts import TypeInference, remembering
 
@@ -283,12 +285,15 @@ def tell_apart(dispatcher: Any, keep: Callable[[Any], Any]) -> None:
     """Keep what has no machine code from Python, which gets it compiled in full; ``keep`` is for Numba's functions."""
     kind = type(dispatcher)
     linked: dict[tuple, Any] = {}
+    is_ours = not is_versioned(module_of(dispatcher.py_func))
 
     def compile_for_caller(signature: Any) -> Any:
         with global_compiler_lock:
             if not is_known:
                 return kind.compile(dispatcher, signature)
             arguments = tuple(normalize_signature(signature)[0])
+            if _depth and is_ours:  # one for ``f(x, 0)`` and ``f(x, 1)``
+                signature = arguments = tuple(map(unliteral, arguments))
             found = dispatcher.overloads.get(arguments)
             if not _depth:
                 if found is not None and isinstance(found.entry_point, _NoMachineCode):
