@@ -46,7 +46,7 @@ Found: TypeAlias = list[str]
 Function: TypeAlias = ast.FunctionDef | ast.AsyncFunctionDef
 LONG, MANY, RUN = 60, 10, 6
 #: Decorators of compiled code.
-KERNELS = {"exact_kernel", "inline_kernel", "intrinsic", "kernel", "loop"}
+KERNELS = {"exact_kernel", "inline_kernel", "intrinsic", "kernel", "loop", "unrolled_loop"}
 
 
 @dataclass(frozen=True)

@@ -106,6 +106,39 @@ def test_what_is_linked_in_is_of_one_library_alone(tmp_path, monkeypatch):
     assert llvm.Linkage.linkonce_odr not in defined.values()
 
 
+def _sum_of(values):
+    total = 0.0
+    for value in values:
+        total += value
+    return total
+
+
+def test_loops_are_vectorised_only_where_it_is_said(tmp_path, monkeypatch):
+    """Both lie on disk under the same name: one is not taken for the other."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    texts = []
+    for decorate in (loop, _numba.unrolled_loop):
+        total = decorate(_sum_of)
+        assert total(np.arange(100.0)) == 4950.0
+        texts.append(str(total.overloads[numba.typeof(VALUES),].library._final_module))
+    assert ["x double>" in text for text in texts] == [False, True]
+
+
+def test_a_kernel_called_with_two_constants_is_compiled_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+
+    @kernel
+    def power(x, exponent):
+        return x if exponent == 1 else x * x
+
+    @loop
+    def both(x):
+        return power(x, 1) + power(x, 2)
+
+    assert both(3.0) == 12.0
+    assert [*power.overloads] == [(numba.float64, numba.int64)]
+
+
 def test_functions_of_numba_alone_between(pair):
     """They call kernels, and are called by loops."""
     weighted, _ = pair

@@ -52,7 +52,7 @@ def compiled_functions():
         for found in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(found, ast.FunctionDef):
                 names = {getattr(mark, "id", "") for mark in found.decorator_list}
-                if names & {"kernel", "loop", "inline_kernel", "exact_kernel"}:
+                if names & {"kernel", "loop", "unrolled_loop", "inline_kernel", "exact_kernel"}:
                     yield path.name, found
 
 

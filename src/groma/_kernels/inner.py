@@ -24,6 +24,7 @@ from typing import Any
 
 import llvmlite.binding as llvm
 import numba
+from numba.core import config
 from numba.core.bytecode import FunctionIdentity
 from numba.core.caching import CompileResultCacheImpl
 from numba.core.codegen import JITCodeLibrary
@@ -36,6 +37,7 @@ from numba.core.targetconfig import ConfigStack
 from numba.core.typed_passes import NativeLowering as NumbaLowering
 from numba.core.typed_passes import NopythonRewrites as NumbaRewrites
 from numba.core.typed_passes import NopythonTypeInference
+from numba.core.types import unliteral
 from numba.core.typing.templates import _OverloadFunctionTemplate
 from numba.core.untyped_passes import InlineClosureLikes as NumbaInlineClosureLikes
 
@@ -43,6 +45,7 @@ from groma._kernels.digest import dependence
 from groma._kernels.elements import NativeLowering
 from groma._kernels.lifetimes import on_demand
 from groma._kernels.loading import rebuilt
+from groma._kernels.parts import is_versioned, module_of
 from groma._kernels.rewrites import InlineClosureLikes, NopythonRewrites
 from groma._kernels.shortcuts import TypeInference, remembering
 
@@ -105,6 +108,8 @@ class _Library(JITCodeLibrary):
 
     #: Whether what was linked in is of no use to other libraries.
     _owns = True
+    #: Whether loops are vectorised and unrolled: a third more work for LLVM, which few of ours repay.
+    is_unrolled = False
 
     def _optimize_functions(self, ll_module: Any) -> None:
         ll_module.data_layout = self._codegen._data_layout
@@ -129,7 +134,23 @@ class _Library(JITCodeLibrary):
         for function in self._final_module.functions if self._owns else ():
             if function.linkage == llvm.Linkage.linkonce_odr:
                 function.linkage = llvm.Linkage.internal
-        super()._optimize_final_module()
+        if self.is_unrolled:
+            super()._optimize_final_module()
+            return
+        self._simplify()
+        tuning = llvm.create_pipeline_tuning_options(config.OPT)  # type: ignore[attr-defined]
+        tuning.loop_vectorization = tuning.slp_vectorization = tuning.loop_unrolling = False
+        builder = llvm.create_pass_builder(self._codegen._tm, tuning)
+        passes = builder.getModulePassManager()
+        passes.add_refprune_pass()
+        passes.run(self._final_module, builder)
+
+    def _simplify(self) -> None:
+        """Inline, turn loops round and simplify."""
+        passes, builder = self._codegen._module_pass_manager(
+            loop_vectorize=False, slp_vectorize=False, opt=0, cost="cheap"
+        )
+        passes.run(self._final_module, builder)
 
 
 class _InnerLibrary(_Library):
@@ -141,11 +162,8 @@ class _InnerLibrary(_Library):
         return self._codegen._function_pass_manager()
 
     def _optimize_final_module(self) -> None:
-        """Inline, turn loops round and simplify; the rest is done once, in the function that this becomes part of."""
-        passes, builder = self._codegen._module_pass_manager(
-            loop_vectorize=False, slp_vectorize=False, opt=0, cost="cheap"
-        )
-        passes.run(self._final_module, builder)
+        """Simplify; the rest is done once, in the function that this becomes part of."""
+        self._simplify()
 
     def _finalize_final_module(self) -> None:
         self._finalize_dynamic_globals()
@@ -177,6 +195,8 @@ class _Steps(PassManager):
 class Pipeline(Compiler):
     """Numba's compiler, which goes less far for functions inside others."""
 
+    is_unrolled = False
+
     def define_pipelines(self) -> Any:
         if not is_known:
             return super().define_pipelines()
@@ -184,6 +204,7 @@ class Pipeline(Compiler):
         if state.library is None:
             kind = _InnerLibrary if _depth > 1 else _Library
             state.library = kind(state.targetctx.codegen(), state.func_id.func_qualname)
+            state.library.is_unrolled = self.is_unrolled
             state.library.enable_object_caching()
             if kind is _Library:  # of two equal functions, each is called by its own name
                 state.func_id.unique_id = next(FunctionIdentity._unique_ids)
@@ -191,6 +212,12 @@ class Pipeline(Compiler):
                 state.flags.no_compile = state.flags.no_cpython_wrapper = state.flags.no_cfunc_wrapper = True
         pipelines = super().define_pipelines()
         return [_ours(pipeline) for pipeline in pipelines]
+
+
+class UnrollingPipeline(Pipeline):
+    """The same, which vectorises and unrolls loops."""
+
+    is_unrolled = True
 
 
 def _ours(steps: PassManager) -> PassManager:
@@ -258,12 +285,15 @@ def tell_apart(dispatcher: Any, keep: Callable[[Any], Any]) -> None:
     """Keep what has no machine code from Python, which gets it compiled in full; ``keep`` is for Numba's functions."""
     kind = type(dispatcher)
     linked: dict[tuple, Any] = {}
+    is_ours = not is_versioned(module_of(dispatcher.py_func))
 
     def compile_for_caller(signature: Any) -> Any:
         with global_compiler_lock:
             if not is_known:
                 return kind.compile(dispatcher, signature)
             arguments = tuple(normalize_signature(signature)[0])
+            if _depth and is_ours:  # one for ``f(x, 0)`` and ``f(x, 1)``
+                signature = arguments = tuple(map(unliteral, arguments))
             found = dispatcher.overloads.get(arguments)
             if not _depth:
                 if found is not None and isinstance(found.entry_point, _NoMachineCode):

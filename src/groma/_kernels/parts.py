@@ -101,7 +101,8 @@ def part_of(thing: Any) -> Part:
     if (name := _versioned_name(thing)) is not None:
         part.text.append(name)
     elif isinstance(thing, Dispatcher):
-        part.text.append(f"compiled {_say_options(thing.targetoptions)} {_say_options(thing.locals)}")
+        pipeline = thing._compiler.pipeline_class.__name__  # type: ignore[attr-defined]
+        part.text.append(f"compiled {pipeline} {_say_options(thing.targetoptions)} {_say_options(thing.locals)}")
         part.add("function", thing.py_func)
     elif isinstance(thing, _Intrinsic):
         part.text.append(f"intrinsic {_say_options(thing._ctor_kwargs)} {thing._prefer_literal}")

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from groma._numba import loop
+from groma._numba import loop, unrolled_loop
 from groma._ordering import median
 from groma._trees import kd_tree, nearest
 from groma._typing import BoolArray, FloatArray, IntArray
@@ -243,7 +243,7 @@ def _coplanar(
     return pairs[flat], planes[flat], values[flat, 1] / variance[flat]
 
 
-@loop
+@unrolled_loop
 def scores_loop(features, labels, gate, reach, planes, homes, which, stamp, number, queue, support, score):
     """For some candidates, how many free features lie on them around their homes (M,), and their information (M,).
 

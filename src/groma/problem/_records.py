@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from groma._numba import exact_kernel, loop
+from groma._numba import exact_kernel, loop, unrolled_loop
 from groma._simd import set_product
 from groma.factors.losses import loss_derivatives, loss_value
 
@@ -37,7 +37,7 @@ def _sum_and_root(cost, rho, weight):
     return cost + rho, np.sqrt(weight)
 
 
-@loop
+@unrolled_loop
 def weigh(record, begin, scale, step, loss_tag, parameters, norms):
     """Scale each record by 1/sigma and by the root of the loss' weight; return sum of rho, write the squared norms."""
     n, m, columns = record.shape

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from groma._numba import loop
+from groma._numba import loop, unrolled_loop
 from groma._simd import add_matvec, add_product, set_product, width, width_for
 from groma._typing import FloatArray, IntArray
 from groma.problem.layout import Chunk, Eliminated, Layout
@@ -46,7 +46,7 @@ PIVOT_TOLERANCE = 1e-13
 # ---------------------------------------------------------------------------------------------------------- Kernels
 
 
-@loop
+@unrolled_loop
 def invert_blocks(V, g, damping, step, begin, end, N, h, singular, steepest, dof):
     """N = -(V + damping D)^-1 and h = N g for landmarks begin..end; undetermined directions do not move.
 
@@ -160,7 +160,7 @@ def _add_incident_steps(pointer, block, W, delta_c, begin, end, t, dof, c_width)
             add_matvec(t, p * dl, W, k * (dl * dc), delta_c, np.int64(block[k]) * dc, dof, c_width)
 
 
-@loop
+@unrolled_loop
 def _landmark_steps(N, t, V, g, begin, end, delta, dof):
     """Delta = N t for landmarks begin..end; return delta D delta and g delta."""
     n = len(dof)

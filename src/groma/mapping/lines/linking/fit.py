@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from groma._numba import kernel, loop
+from groma._numba import kernel, loop, unrolled_loop
 from groma._simd import width
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.batch_least_squares import PROBLEMS_AT_ONCE, Observations, solve_batch, solve_damped
@@ -116,7 +116,7 @@ def fit_lines(
 
 
 # ------------------------------------------------------------------------------------------------------------ Recover
-@loop
+@unrolled_loop
 def find_on_lines(P, X, order, ends, sigma, forward, gate, min_overlap, min_px, found, distance):
     """Segments of one image that lie on projections of lines; return the number written, or needed.
 
