@@ -2,10 +2,10 @@
 """Depth maps of photographs: a folder with one PNG or TIFF, ``.npy``, ``.npz`` or map of COLMAP for each.
 
 In come the folder and the names of photographs; ``rooms/IMG_1.jpg`` has ``rooms/IMG_1.png`` or COLMAP's
-``rooms/IMG_1.jpg.geometric.bin``, or ``IMG_1.png`` where the folder has no folders. Maps of a lower or higher resolution
-are read at the nearest pixel. Out come images of depths along the optical axis, of the size of the photographs, 0 where
-nothing is known: what is zero, negative or not finite, and 65535 in whole numbers of 16 bit. Headers are checked before
-data are decompressed.
+``rooms/IMG_1.jpg.geometric.bin``, or ``IMG_1.png`` where the folder has no folders. Out come images of depths along the
+optical axis, of the size of the photographs: maps of another resolution are read at the nearest pixel. 0 is where
+nothing is known: what is zero, negative or not finite, and 65535 in whole numbers of 16 bit. Headers are checked
+before data are decompressed.
 """
 
 from __future__ import annotations
