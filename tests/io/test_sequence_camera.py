@@ -125,8 +125,9 @@ def test_yaml_that_is_refused(tmp_path, text, words):
 
 
 def test_matrix_file(tum):
-    (tum / "camera.txt").write_text("50 0 32\n0 51 24\n0 0 1\n")
-    np.testing.assert_array_equal(open_sequence(tum).camera.params, [50, 51, 32.5, 24.5])
+    for text in ("50 0 32\n0 51 24\n0 0 1\n", "50 0 32 0\n0 51 24 0\n0 0 1 0\n0 0 0 1\n"):
+        (tum / "camera.txt").write_text(text)
+        np.testing.assert_array_equal(open_sequence(tum).camera.params, [50, 51, 32.5, 24.5])
 
 
 @pytest.mark.parametrize(

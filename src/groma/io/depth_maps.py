@@ -104,9 +104,7 @@ class DepthMaps:
                 raw = _read_arrays(path, size) if ending in (".npy", ".npz") else _read_picture(path)
         raw = raw.reshape([n for n in raw.shape if n != 1] if raw.ndim > 2 else raw.shape)
         _check_size(path, raw.shape, size)
-        if raw.shape != (size[1], size[0]):
-            row, column = ((np.arange(n) + 0.5) * m / n for n, m in zip(size[::-1], raw.shape, strict=True))
-            raw = raw[np.ix_(row.astype(np.int64), column.astype(np.int64))]
+        raw = at_size(raw, size)
         whole = raw.dtype.kind in "iu"
         depth = raw.astype(np.float32) / np.float32(self.scale or (WHOLE_NUMBERS if whole else 1.0))
         with np.errstate(invalid="ignore"):
@@ -120,6 +118,24 @@ class DepthMaps:
             return False
         known = depth[depth > 0.0]
         return bool(len(known)) and float(np.median(known)) > 100.0 and bool((known == np.round(known)).all())
+
+
+def has_proportions(shape: tuple[int, ...], size: tuple[int, int]) -> bool:
+    """Whether a shape is (height, width) of a size (width, height), or of one made smaller or larger."""
+    if len(shape) != 2 or not min(shape):
+        return False
+    # derived: width and height of the smaller image are each off by less than a pixel of it
+    slip = abs(shape[1] * size[1] - shape[0] * size[0])
+    scaled = shape[1] != size[0] and shape[0] != size[1] and slip < max(sum(size), sum(shape))
+    return scaled or shape == (size[1], size[0])
+
+
+def at_size(raw: Array, size: tuple[int, int]) -> Array:
+    """Return the nearest pixels of an image (h, w) at those of a size (width, height)."""
+    if raw.shape == (size[1], size[0]):
+        return raw
+    row, column = ((np.arange(n) + 0.5) * m / n for n, m in zip(size[::-1], raw.shape, strict=True))
+    return raw[np.ix_(row.astype(np.int64), column.astype(np.int64))]
 
 
 def _read_picture(path: Path) -> Array:
@@ -166,9 +182,7 @@ def _check_size(path: Path, shape: tuple[int, ...], size: tuple[int, int]) -> No
     """Refuse an array that is not (height, width), or has other proportions."""
     if len(shape) != 2:
         raise FileFormatError(f"{path} has the shape {shape}; expected (height, width), {(size[1], size[0])}.")
-    # derived: width and height of the smaller image are each off by less than a pixel of it
-    slip, scaled = abs(shape[1] * size[1] - shape[0] * size[0]), shape[1] != size[0] and shape[0] != size[1]
-    if shape == (size[1], size[0]) or (scaled and min(shape) and slip < max(sum(size), sum(shape))):
+    if has_proportions(shape, size):
         return
     turned = " It is turned by 90 degrees." if shape == size else ""
     raise FileFormatError(

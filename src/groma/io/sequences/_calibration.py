@@ -33,8 +33,8 @@ FILE_NAMES = ("cameras.txt", "camera.txt", "calibration.txt", "calib.txt", "intr
 _BAND = 1 << 18
 
 _HELP = (
-    "expected 'fx fy cx cy', 'fx fy cx cy k1 k2 p1 p2 [k3 [k4 k5 k6]]', a 3x3 matrix, a line of COLMAP's cameras.txt "
-    "('1 PINHOLE 640 480 fx fy cx cy'), or a .yaml file of Kalibr, ROS or OpenCV"
+    "expected 'fx fy cx cy', 'fx fy cx cy k1 k2 p1 p2 [k3 [k4 k5 k6]]', a 3x3 or 4x4 matrix, a line of COLMAP's "
+    "cameras.txt ('1 PINHOLE 640 480 fx fy cx cy'), or a .yaml file of Kalibr, ROS or OpenCV"
 )
 
 
@@ -198,8 +198,8 @@ def _from_text(text: str, source: str) -> Calibration:
             size = whole(words[1], wrong, "the width"), whole(words[2], wrong, "the height")
             return _checked(words[0], np.array(finite(words[3:], wrong)), size, source)
     numbers = np.array(finite((word for words in lines for word in words), wrong, _HELP.removeprefix("expected ")))
-    if len(lines) == 3 and len(numbers) == 9:
-        return _from_numbers(numbers[[0, 4, 2, 5]], source)
+    if len(lines) in (3, 4) and len(numbers) == len(lines) ** 2:  # ScanNet writes 4x4
+        return _from_numbers(numbers.reshape(len(lines), -1)[[0, 1, 0, 1], [0, 1, 2, 2]], source)
     return _from_numbers(numbers, source)
 
 
