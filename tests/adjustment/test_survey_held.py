@@ -52,7 +52,7 @@ def test_measurements_in_another_frame_than_held_objects_are_refused(truth):
     there = positions(truth, np.random.default_rng(0), 1e-3)
     held = Survey(hold=(scene.images.names[5],))
     assert with_survey(scene.replace(camera_positions=there), held).scene.held.idx.tolist() == [5]
-    utm = there.replace(xyz=there.xyz + [5e5, 5e6, 0.0])
+    utm = there.replace(xyz=there.xyz + np.array([5e5, 5e6, 0.0]))
     with pytest.raises(InputError, match=r"parts of it are held\. The measured places are 5.02e\+06 away .* frame"):
         with_survey(scene.replace(camera_positions=utm), held)
     rough = utm.replace(covariance=np.tile(1e13 * np.eye(3), (len(utm), 1, 1)))
