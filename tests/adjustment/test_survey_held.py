@@ -46,6 +46,19 @@ def test_what_is_held_keeps_its_place(truth):
         with_survey(start, Survey(hold=("0000l.png",)))
 
 
+def test_measurements_in_another_frame_than_held_objects_are_refused(truth):
+    """They would pull the scene to pieces; positions that are merely rough are not in another frame."""
+    scene = holistic(8, noise_px=0.5, seed=1).start
+    there = positions(truth, np.random.default_rng(0), 1e-3)
+    held = Survey(hold=(scene.images.names[5],))
+    assert with_survey(scene.replace(camera_positions=there), held).scene.held.idx.tolist() == [5]
+    utm = there.replace(xyz=there.xyz + np.array([5e5, 5e6, 0.0]))
+    with pytest.raises(InputError, match=r"parts of it are held\. The measured places are 5.02e\+06 away .* frame"):
+        with_survey(scene.replace(camera_positions=utm), held)
+    rough = utm.replace(covariance=np.tile(1e13 * np.eye(3), (len(utm), 1, 1)))
+    with_survey(scene.replace(camera_positions=rough), held)
+
+
 def test_a_scene_settles_where_all_measurements_fit(truth):
     """A similarity away from where it was measured in several ways it goes back, measurements staying."""
     rng = np.random.default_rng(0)

@@ -50,6 +50,7 @@ def test_poses_place_a_scene_and_wrong_ones_are_named(truth):
     given.world_from_cam[4, 0] += 0.5
     found = with_survey(truth.transformed(ELSEWHERE), Survey(poses=given))
     assert np.abs(found.scene.cam_centers_in_world - truth.cam_centers_in_world).max() < 0.1
+    assert any("into the frame of the measured poses" in note for note in found.notes)
     result = adjust(found.scene, LEAST_SQUARES)
     tests = reliability(result.scene, result.problem)
     assert tests.suspects[0].name == "00005.png" and tests.suspects[0].kind == "camera pose"

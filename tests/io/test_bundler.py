@@ -53,10 +53,12 @@ def test_without_photographs_pixels_count_from_the_centre(true, tmp_path):
     np.testing.assert_array_equal(scene.points.color, true.color)
 
 
-def test_with_photographs_pixels_count_from_the_corner(true, tmp_path):
+@pytest.mark.parametrize("listed", ["list.txt", "prepare/list.txt"])
+def test_with_photographs_pixels_count_from_the_corner(true, tmp_path, listed):
     """The image centre of Bundler is half the size; v grows downwards here."""
     photographs(tmp_path, NAMES)
-    (tmp_path / "list.txt").write_text("".join(f"{name} 0 532.5\n" for name in NAMES))
+    (tmp_path / listed).parent.mkdir(exist_ok=True)
+    (tmp_path / listed).write_text("".join(f"./{name} 0 532.5\n" for name in NAMES))
     (tmp_path / "bundle").mkdir()
     (tmp_path / "bundle" / "bundle.out").write_text(bundle(true))
     scene = read_scene(tmp_path / "bundle")

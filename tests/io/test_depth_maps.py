@@ -5,6 +5,7 @@ import zipfile
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 
 from groma.errors import FileFormatError, GromaError, InputError
@@ -21,14 +22,37 @@ def folder(tmp_path):
     np.savez_compressed(tmp_path / "c.npz", depth=DEPTH.astype(np.float32), other=np.zeros(3))
     np.save(tmp_path / "d.npy", np.round(1000 * DEPTH).astype(np.int32))
     np.savez(tmp_path / "e.npz", DEPTH[None])
+    (tmp_path / "f.jpg.geometric.bin").write_bytes(b"6&4&1&" + DEPTH.astype("<f4").tobytes())
+    cv2.imwrite(str(tmp_path / "g.tiff"), DEPTH.astype(np.float32))
     return tmp_path
 
 
-@pytest.mark.parametrize("name", ["a.png", "b.npy", "c.npz", "d.npy", "e.npz"])
+@pytest.mark.parametrize("name", ["a.png", "b.npy", "c.npz", "d.npy", "e.npz", "f.jpg.geometric.bin", "g.tiff"])
 def test_every_kind_is_read_in_metres(folder, name):
     read = DepthMaps(folder).read(folder / name, SIZE)
     assert read.dtype == np.float32
     assert read == pytest.approx(DEPTH, abs=1e-6)
+
+
+def test_maps_of_colmap_belong_to_the_whole_name_of_a_photograph(folder):
+    from_colmap = pycolmap.DepthMap()
+    from_colmap.read(folder / "f.jpg.geometric.bin")
+    assert DepthMaps(folder).read(folder / "f.jpg.geometric.bin", SIZE) == pytest.approx(from_colmap.to_array())
+    (folder / "f.jpg.photometric.bin").write_bytes(b"6&4&1&" + bytes(96))
+    (folder / "h.jpg.photometric.bin").write_bytes(b"6&4&1&" + bytes(96))
+    names = ["f.jpg.geometric.bin", "h.jpg.photometric.bin"]
+    assert DepthMaps(folder).files(["f.jpg", "h.jpg"]) == [folder / name for name in names]
+
+
+def test_maps_of_another_resolution_are_read_at_the_nearest_pixel(folder):
+    """Centres of pixels: those of 12 x 8 fall in pairs on those of 6 x 4, those of 3 x 2 between pairs."""
+    maps = DepthMaps(folder)
+    assert maps.read(folder / "b.npy", (12, 8)) == pytest.approx(DEPTH.repeat(2, 0).repeat(2, 1))
+    assert maps.read(folder / "b.npy", (3, 2)) == pytest.approx(DEPTH[1::2, 1::2])
+    assert maps.read(folder / "b.npy", (61, 40)).shape == (40, 61)  # 6.1 x 4 pixels, off by less than one
+    for size in ((60, 20), (6, 5), (5, 4)):
+        with pytest.raises(FileFormatError, match="proportions of the photographs"):
+            maps.read(folder / "b.npy", size)
 
 
 def test_the_scale_is_that_of_the_files(folder):
@@ -68,6 +92,9 @@ def test_wrong_files_are_refused_in_one_line(folder):
     cv2.imwrite(str(folder / "colour.png"), np.ones((4, 6, 3), np.uint8))
     (folder / "text.png").write_text("depth")
     (folder / "text.npy").write_text("depth")
+    (folder / "cut.jpg.geometric.bin").write_bytes(b"6&4&1&" + bytes(95))
+    (folder / "text.bin").write_text("depth")
+    cv2.imwrite(str(folder / "grey.tif"), np.ones((4, 6), np.uint8))
     (folder / "cut.npy").write_bytes((folder / "b.npy").read_bytes()[:-8])
     np.save(folder / "stack.npy", np.zeros((2, 4, 6)))
     np.save(folder / "words.npy", np.full((4, 6), "deep"))
@@ -76,6 +103,9 @@ def test_wrong_files_are_refused_in_one_line(folder):
         "grey.png": "1 channel of 8 bits; expected a grey PNG of 16 bits",
         "colour.png": "3 channels of 8 bits",
         "text.png": "cannot be read as a PNG",
+        "cut.jpg.geometric.bin": "no depth map of COLMAP, or is damaged",
+        "text.bin": "no depth map of COLMAP, or is damaged",
+        "grey.tif": "1 channel of 8 bits",
         "text.npy": "no header",
         "cut.npy": "needs 192 bytes but 184 follow",
         "stack.npy": r"shape \(2, 4, 6\); expected \(height, width\), \(4, 6\)",

@@ -8,7 +8,7 @@ from _sequences import POINTS, blob_center, blob_image
 
 from groma import cameras
 from groma.errors import InputError
-from groma.io.sequences import SequenceCamera, open_sequence
+from groma.io.sequences import SequenceCamera, calibration_of, open_sequence
 
 
 def test_a_camera_takes_lists_and_keeps_an_array_of_its_own():
@@ -58,9 +58,76 @@ def test_ways_to_say_a_camera(tum, tmp_path, camera, params):
         np.testing.assert_array_equal(open_sequence(tum, camera=tmp_path / "other.txt").camera.params, params)
 
 
+KALIBR = """cam0:
+  T_cam_imu:
+  - [1.0, 0.0, 0.0, 0.0]
+  camera_model: pinhole
+  distortion_coeffs: [-0.2, 0.05, 0.001, 0.002]
+  distortion_model: radtan
+  intrinsics: [50, 51, 32, 24]
+  resolution: [64, 48]
+"""
+ROS = """image_width: 64
+image_height: 48
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [50, 0, 32,
+         0, 51, 24, 0, 0, 1]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [-0.2, 0.05, 0.001, 0.002, 0.0]
+projection_matrix:
+  data: [40, 0, 30, 0, 0, 40, 20, 0, 0, 0, 1, 0]
+"""
+OPENCV = ROS.replace("matrix:\n", "matrix: !!opencv-matrix\n").replace("distortion_model: plumb_bob\n", "")
+
+
+@pytest.mark.parametrize("text", [KALIBR, ROS, "%YAML:1.0\n---\n" + OPENCV])
+def test_files_of_kalibr_ros_and_opencv_hold_the_same_camera(tmp_path, text):
+    (tmp_path / "camera.yaml").write_text(text)
+    found, same = calibration_of(tmp_path / "camera.yaml"), calibration_of("50 51 32 24 -0.2 0.05 0.001 0.002")
+    assert (found.model, found.size) == (same.model, (64, 48)) == ("OPENCV", (64, 48))
+    np.testing.assert_array_equal(found.params, same.params)
+
+
+def test_other_lenses_in_yaml(tmp_path):
+    path = tmp_path / "camera.yml"
+    path.write_text(KALIBR.replace("radtan", "equidistant"))
+    assert calibration_of(path).model == "OPENCV_FISHEYE"
+    assert calibration_of(path).params.tolist() == [50, 51, 32.5, 24.5, -0.2, 0.05, 0.001, 0.002]
+    eight = ROS.replace("plumb_bob", "rational_polynomial").replace("0.002, 0.0]", "0.002, 3, 4, 5, 6]")
+    path.write_text(eight)
+    assert calibration_of(path).model == "FULL_OPENCV" and calibration_of(path).params[8:].tolist() == [3, 4, 5, 6]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (KALIBR + KALIBR.replace("cam0", "cam1"), "several cameras"),
+        (KALIBR.replace("pinhole", "omni"), "camera_model must be pinhole; got omni"),
+        (KALIBR.replace("radtan", "fov"), "distortion_model must be"),
+        (KALIBR.replace(", 0.001, 0.002]", "]"), "6 numbers"),
+        (KALIBR.replace("radtan", "equidistant").replace(", 0.001, 0.002]", "]"), "takes 8 finite numbers"),
+        (KALIBR.replace("[64, 48]", "[64]"), "camera.yaml"),
+        (ROS.replace("image_width: 64", ""), "image_width: expected a whole number"),
+        (ROS.replace("0, 51, 24, 0, 0, 1]", "]"), "camera.yaml"),
+        ("cam0:\n", "no entry intrinsics"),
+    ],
+)
+def test_yaml_that_is_refused(tmp_path, text, words):
+    (tmp_path / "camera.yaml").write_text(text)
+    with pytest.raises(InputError, match=words) as caught:
+        calibration_of(tmp_path / "camera.yaml")
+    assert str(tmp_path / "camera.yaml") in str(caught.value)
+
+
 def test_matrix_file(tum):
-    (tum / "camera.txt").write_text("50 0 32\n0 51 24\n0 0 1\n")
-    np.testing.assert_array_equal(open_sequence(tum).camera.params, [50, 51, 32.5, 24.5])
+    for text in ("50 0 32\n0 51 24\n0 0 1\n", "50 0 32 0\n0 51 24 0\n0 0 1 0\n0 0 0 1\n"):
+        (tum / "camera.txt").write_text(text)
+        np.testing.assert_array_equal(open_sequence(tum).camera.params, [50, 51, 32.5, 24.5])
 
 
 @pytest.mark.parametrize(

@@ -85,7 +85,7 @@ def test_faults(tum):
     (tum / "rgb.txt").write_text("\n".join(lines))
     (tum / "rgb/1.png").write_bytes(b"no image")
     image(tum / "rgb/3.png", 30, (32, 24))
-    image(tum / "depth/0.png", 1000, (32, 24), np.uint16)
+    image(tum / "depth/0.png", 1000, (32, 20), np.uint16)
     sequence = open_sequence(tum)
     frames = list(sequence)
     assert [frame.timestamp for frame in frames] == [10.0, 10.2, 10.4, 10.5]
@@ -94,7 +94,7 @@ def test_faults(tum):
     for words in ("not in order", "0.png has the time of 5.png", "1.png cannot be read", "none.png cannot be read"):
         assert words in text
     assert "3.png is 32x24, not 64x48" in text
-    assert "0.png is 32x24, not 64x48 grey" in text
+    assert "0.png is 32x20, not 64x48 grey" in text
 
 
 def test_a_picture_of_depths_is_no_depth(tum):
@@ -253,6 +253,28 @@ def test_color_and_depth_by_number(tmp_path):
     said = open_sequence(tmp_path, camera="50 50 32 24", depth_scale=500)
     assert next(iter(said)).depth[0, 0] == 2.0 and not said.warnings
     assert open_sequence(tmp_path, camera="50 50 32 24", kind="mono").warnings == []
+
+
+def test_color_and_depth_in_one_folder(tmp_path):
+    """As Replica has them; photographs that happen to be named after depth are photographs."""
+    for number in range(2):
+        image(tmp_path / f"results/frame{number:06d}.jpg", 10 + number)
+        image(tmp_path / f"results/depth{number:06d}.png", 1000 * (number + 1), dtype=np.uint16)
+    for place in (tmp_path, tmp_path / "results"):
+        sequence = open_sequence(place, camera="50 50 32 24")
+        assert sequence.kind == "rgbd" and [frame.depth[0, 0] for frame in sequence] == [1.0, 2.0]
+    image(tmp_path / "results/in_depth.jpg", 12)
+    sequence = open_sequence(tmp_path / "results", camera="50 50 32 24")
+    assert sequence.kind == "mono" and len(sequence) == 5
+
+
+def test_depth_of_another_resolution(tmp_path):
+    image(tmp_path / "rgb/1.png", 1)
+    depth = np.arange(1, 13, dtype=np.uint16).reshape(3, 4) * 1000
+    (tmp_path / "depth").mkdir()
+    assert cv2.imwrite(str(tmp_path / "depth/1.png"), depth)
+    frame = next(iter(open_sequence(tmp_path, camera="50 50 32 24")))
+    assert frame.depth == pytest.approx(depth.repeat(16, 0).repeat(16, 1) / 1000.0, rel=1e-6)
 
 
 def test_color_and_depth_by_time(tmp_path):

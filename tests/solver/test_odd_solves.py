@@ -48,6 +48,8 @@ def test_one_camera_one_point():
     problem = scene_problem(num_cameras=1, num_points=1, views=1)
     report = solve(problem).report
     assert report.final_cost < 1e-6
+    assert not report.warnings  # 2 residuals of 9 unknowns, and 7 are the position, rotation and scale of the world
+    report = solve(scene_problem(num_cameras=1, num_points=2, views=1)).report
     assert any("fewer residuals" in warning for warning in report.warnings)
 
 

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Depth maps of photographs: a folder with one 16-bit PNG, ``.npy`` or ``.npz`` for each, of the same size.
+"""Depth maps of photographs: a folder with one PNG or TIFF, ``.npy``, ``.npz`` or map of COLMAP for each.
 
-In come the folder and the names of photographs; ``rooms/IMG_1.jpg`` has ``rooms/IMG_1.png``, or ``IMG_1.png`` where the
-folder has no folders. Out come images of depths along the optical axis, 0 where nothing is known: what is zero,
-negative or not finite, and 65535 in whole numbers of 16 bit. Headers are checked before data are decompressed.
+In come the folder and the names of photographs; ``rooms/IMG_1.jpg`` has ``rooms/IMG_1.png`` or COLMAP's
+``rooms/IMG_1.jpg.geometric.bin``, or ``IMG_1.png`` where the folder has no folders. Out come images of depths along the
+optical axis, of the size of the photographs: maps of another resolution are read at the nearest pixel. 0 is where
+nothing is known: what is zero, negative or not finite, and 65535 in whole numbers of 16 bit. Headers are checked
+before data are decompressed.
 """
 
 from __future__ import annotations
@@ -22,7 +24,9 @@ from groma.errors import FileFormatError, InputError
 from groma.io.reading import reading
 
 #: Endings of depth maps, in small letters.
-ENDINGS = (".png", ".npy", ".npz")
+ENDINGS = (".png", ".tif", ".tiff", ".npy", ".npz", ".bin")
+#: Endings of COLMAP's maps, after the whole name of the photograph; the first is better where there are both.
+_COLMAP = (".geometric.bin", ".photometric.bin")
 #: Whole numbers in files per unit of length: millimetres (convention: of the format).
 WHOLE_NUMBERS = 1000.0
 #: The array of an ``.npz`` file that holds more than one.
@@ -64,7 +68,10 @@ class DepthMaps:
         maps: dict[str, list[Path]] = {}
         for path in sorted(self.folder.rglob("*")):
             if path.suffix.lower() in ENDINGS and path.is_file():
-                maps.setdefault(path.relative_to(self.folder).with_suffix("").as_posix(), []).append(path)
+                name = path.relative_to(self.folder).as_posix()
+                key = PurePosixPath(name.removesuffix(_COLMAP[0]).removesuffix(_COLMAP[1])).with_suffix("").as_posix()
+                if not (name.endswith(_COLMAP[1]) and key in maps):
+                    maps.setdefault(key, []).append(path)
         stems = [PurePosixPath(name).with_suffix("") for name in names]
         if not any("/" in key for key in maps) and len({stem.name for stem in stems}) == len(stems):
             stems = [PurePosixPath(stem.name) for stem in stems]
@@ -87,12 +94,17 @@ class DepthMaps:
         Raises
         ------
         FileFormatError
-            If the file holds no depth map, or one of another size.
+            If the file holds no depth map, or one of other proportions.
         """
+        ending = path.suffix.lower()
         with reading(path, "depth map"):
-            raw = _read_png(path) if path.suffix.lower() == ".png" else _read_arrays(path, size)
+            if ending == ".bin":
+                raw = _read_colmap(path)
+            else:
+                raw = _read_arrays(path, size) if ending in (".npy", ".npz") else _read_picture(path)
         raw = raw.reshape([n for n in raw.shape if n != 1] if raw.ndim > 2 else raw.shape)
         _check_size(path, raw.shape, size)
+        raw = at_size(raw, size)
         whole = raw.dtype.kind in "iu"
         depth = raw.astype(np.float32) / np.float32(self.scale or (WHOLE_NUMBERS if whole else 1.0))
         with np.errstate(invalid="ignore"):
@@ -108,17 +120,44 @@ class DepthMaps:
         return bool(len(known)) and float(np.median(known)) > 100.0 and bool((known == np.round(known)).all())
 
 
-def _read_png(path: Path) -> Array:
+def has_proportions(shape: tuple[int, ...], size: tuple[int, int]) -> bool:
+    """Whether a shape is (height, width) of a size (width, height), or of one made smaller or larger."""
+    if len(shape) != 2 or not min(shape):
+        return False
+    # derived: width and height of the smaller image are each off by less than a pixel of it
+    slip = abs(shape[1] * size[1] - shape[0] * size[0])
+    scaled = shape[1] != size[0] and shape[0] != size[1] and slip < max(sum(size), sum(shape))
+    return scaled or shape == (size[1], size[0])
+
+
+def at_size(raw: Array, size: tuple[int, int]) -> Array:
+    """Return the nearest pixels of an image (h, w) at those of a size (width, height)."""
+    if raw.shape == (size[1], size[0]):
+        return raw
+    row, column = ((np.arange(n) + 0.5) * m / n for n, m in zip(size[::-1], raw.shape, strict=True))
+    return raw[np.ix_(row.astype(np.int64), column.astype(np.int64))]
+
+
+def _read_picture(path: Path) -> Array:
     image = decoded(path.read_bytes(), _UNCHANGED)
     if image is None:
-        raise FileFormatError(f"{path} cannot be read as a PNG. Write it again.")
-    if image.dtype != np.uint16 or image.ndim != 2:
+        raise FileFormatError(f"{path} cannot be read as a PNG or TIFF. Write it again.")
+    if image.dtype not in (np.uint16, np.float32, np.float64) or image.ndim != 2:
         channels = 1 if image.ndim == 2 else image.shape[2]
         raise FileFormatError(
             f"{path} has {channels} {'channel' if channels == 1 else 'channels'} of {8 * image.dtype.itemsize} bits; "
             "expected a grey PNG of 16 bits. Save depths as 16-bit PNG, .npy or .npz."
         )
     return image
+
+
+def _read_colmap(path: Path) -> Array:
+    """Read a map of COLMAP: width, height and channels as text, each with ``&``, then single precision, row by row."""
+    *words, data = path.read_bytes().split(b"&", 3)
+    shape = [int(word) for word in words if word.isdigit() and len(word) < 10]
+    if len(shape) != 3 or shape[2] != 1 or len(data) != 4 * math.prod(shape):
+        raise FileFormatError(f"{path} is no depth map of COLMAP, or is damaged. Write it again.")
+    return np.frombuffer(data, "<f4").reshape(shape[1], shape[0])
 
 
 def _read_arrays(path: Path, size: tuple[int, int]) -> Array:
@@ -140,13 +179,13 @@ def _read_arrays(path: Path, size: tuple[int, int]) -> Array:
 
 
 def _check_size(path: Path, shape: tuple[int, ...], size: tuple[int, int]) -> None:
-    """Refuse an array that is not (height, width)."""
-    if shape == (size[1], size[0]):
-        return
+    """Refuse an array that is not (height, width), or has other proportions."""
     if len(shape) != 2:
         raise FileFormatError(f"{path} has the shape {shape}; expected (height, width), {(size[1], size[0])}.")
+    if has_proportions(shape, size):
+        return
     turned = " It is turned by 90 degrees." if shape == size else ""
     raise FileFormatError(
         f"{path} has {shape[1]}x{shape[0]} pixels, its photograph {size[0]}x{size[1]}.{turned} Pass depth maps of the "
-        "size of the photographs, registered to them."
+        "proportions of the photographs, registered to them."
     )

@@ -141,7 +141,10 @@ def _points(scene: Scene, seen: _Observed, straight: FloatArray, count: int) -> 
     """Points of tracks: nearest to their rays, then refined, twice, each time without what does not agree."""
     xyz = _nearest_to_rays(scene, seen, straight)
     covariance, scale = np.zeros((len(xyz), 3, 3)), 1.0
-    bare = scene.keep(points=[], lines=[], planes=[], directions=[])
+    # without measurements, which the held cameras answer already
+    bare = Scene(
+        scene.cameras, scene.rigs, scene.sensors, scene.frames, scene.images, camera_motions=scene.camera_motions
+    )
     for loss in (Cauchy(2.0), LANDMARK_LOSS):
         good = np.isfinite(xyz).all(axis=1) & (np.bincount(seen.track, minlength=len(xyz)) > 1)
         seen = seen.take(good[seen.track])

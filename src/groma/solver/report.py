@@ -14,6 +14,8 @@ from groma.problem.linearization import NormalEquations
 from groma.problem.problem import Problem
 from groma.solver.termination import Termination
 
+#: Position, rotation and scale of a whole scene: nobody misses residuals for these.
+_GAUGE = 7
 STAGES = ("setup", "linearize", "schur", "solve", "backsubstitute", "cost")
 
 
@@ -160,7 +162,7 @@ def warn_of_oddities(report: SolveReport) -> None:
             f"{counted(report.num_underdetermined_landmarks, 'landmarks')} with an unobservable direction; along it "
             "nothing was moved."
         )
-    if report.num_residuals < report.num_unknowns:
+    if report.num_residuals < report.num_unknowns - _GAUGE:
         report.warnings.append(
             f"There are fewer residuals ({report.num_residuals:,}) than unknowns ({report.num_unknowns:,}): the result "
             "is one of many. Hold variables constant, add priors or add observations."

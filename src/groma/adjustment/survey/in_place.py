@@ -60,13 +60,12 @@ def placing(before: Scene, scene: Scene, survey: Survey, frame: WorldFrame, note
     InputError
         If places are too few, or axes do not fit.
     """
-    if len(scene.held):
-        notes.append("The scene stays where it is, because parts of it are held.")
-        return Placing(Similarity())
-    if before.is_tied:
-        notes.append("The scene is placed by measurements already and stays where it is.")
-        return Placing(Similarity())
     source, target, names = _correspondences(scene)
+    if len(scene.held) or before.is_tied:
+        held = "The scene stays where it is, because parts of it are held."
+        notes.append(held if len(scene.held) else "The scene is placed by measurements already and stays where it is.")
+        _check_near(scene, source, target, notes[-1])
+        return Placing(Similarity())
     if len(source) == 0:
         scaled = _scaled(scene, notes)
         return Placing(level(scene.transformed(scaled, measured=False), notes).after(scaled))
@@ -100,8 +99,9 @@ def placing(before: Scene, scene: Scene, survey: Survey, frame: WorldFrame, note
     if _is_there(scene, fit):
         notes.append("The given poses are in the frame of the measurements already: the scene stays where it is.")
         return Placing(Similarity())
+    into = "the frame of the measured poses" if len(source) == len(scene.camera_poses) else frame.description
     notes.append(
-        f"The scene was brought into {frame.description} by a similarity (scale {fit.similarity.scale:.6g}) to "
+        f"The scene was brought into {into} by a similarity (scale {fit.similarity.scale:.6g}) to "
         f"{int(fit.inliers.sum())} of {len(fit.inliers)} measured places, which scatter by {fit.scatter:.3g} a "
         "coordinate."
     )
@@ -118,6 +118,18 @@ def _correspondences(scene: Scene) -> tuple[FloatArray, FloatArray, Sequence[str
     target = np.concatenate([positions.xyz, camera_centers(poses.cam_from_world), points.measured[usable]])
     names = [scene.images.names[row] for row in images] + [points.names[row] for row in usable]
     return source, target, names
+
+
+def _check_near(scene: Scene, source: FloatArray, target: FloatArray, stays: str) -> None:
+    """Refuse places that are farther from where the scene has them than it is large: they are in another frame."""
+    size = float(np.linalg.norm(np.ptp(np.concatenate([scene.cam_centers_in_world, scene.points.xyz]), axis=0)))
+    away = float(np.median(np.linalg.norm(target - source, axis=1))) if len(source) else 0.0
+    noise = np.trace(scene.camera_positions.covariance, axis1=1, axis2=2)
+    if away > size + NORMAL.far * np.sqrt(noise.max(initial=0.0)):
+        raise InputError(
+            f"{stays} The measured places are {away:.3g} away from where it has them, farther than it is large "
+            f"({size:.3g}). Pass measurements in its frame, or bring it into theirs first (groma align)."
+        )
 
 
 def _by_orientations(scene: Scene, fit: RobustSimilarity, source: FloatArray, target: FloatArray) -> RobustSimilarity:

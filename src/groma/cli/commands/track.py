@@ -30,8 +30,8 @@ def track(
     camera: Annotated[
         str | None,
         _options.CAMERAS.option(
-            "Calibration file, or parameters in OpenCV's order: fx fy cx cy [k1 k2 p1 p2 [k3]]. Default: that of the "
-            "sequence.",
+            "Calibration file (also YAML of Kalibr, ROS or OpenCV), or parameters in OpenCV's order: fx fy cx cy [k1 "
+            "k2 p1 p2 [k3 [k4 k5 k6]]]. Default: that of the sequence.",
             metavar="CAMERA",
         ),
     ] = None,

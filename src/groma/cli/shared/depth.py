@@ -19,8 +19,8 @@ PANEL = Panel("Depth maps")
 Depth = Annotated[
     Path | None,
     PANEL.option(
-        "Depth maps with the names and sizes of the photographs: 16-bit PNG (millimetres), .npy or .npz (metres); they "
-        "define the unit of length.",
+        "Depth maps with the names and proportions of the photographs: 16-bit PNG (millimetres), .npy, .npz or TIFF "
+        "(metres), or COLMAP's; they define the unit of length.",
         metavar="FOLDER",
     ),
 ]

@@ -45,8 +45,8 @@ def read_bundler(path: str | os.PathLike[str]) -> Scene:
     Parameters
     ----------
     path : path
-        The bundle file, or its folder. The list is ``list.txt`` there or one folder up, or, for ``NAME.out``,
-        ``NAME.list.txt`` or ``NAME.txt``.
+        The bundle file, or its folder. The list is ``list.txt`` there, one folder up or in ``prepare`` there, or, for
+        ``NAME.out``, ``NAME.list.txt`` or ``NAME.txt``.
 
     Raises
     ------
@@ -97,14 +97,16 @@ def _counts(body: bytes, path: Path) -> tuple[int, int]:
 def _names(path: Path, count: int) -> tuple[Path, list[str]]:
     """Return the folder of the images, and their names: the first word of each line of the list."""
     beside = [path.with_name("list.txt"), path.with_suffix(".list.txt"), path.with_suffix(".txt")]
-    candidates = [*beside, path.absolute().parent.parent / "list.txt"]
+    above = path.absolute().parent.parent
+    prepared = above / "prepare" / "list.txt"  # of RunBundler.sh; its names begin one folder up, too
+    candidates = [*beside, above / "list.txt", prepared]
     found = next((place for place in candidates if place.is_file()), None)
     if found is None:
         return path.parent, [f"{row:08d}.jpg" for row in range(count)]
     names = [line.split()[0] for _, line in read_lines(found)]
     if len(names) != count:
         raise FileFormatError(f"{found} should name {count} images, one a line, as {path.name} has; got {len(names)}.")
-    return found.parent, [os.path.normpath(name).replace(os.sep, "/") for name in names]
+    return above if found == prepared else found.parent, [os.path.normpath(name).replace(os.sep, "/") for name in names]
 
 
 def _calibration(lens: tuple[float, float, float], size: tuple[int, int]) -> Calibration:

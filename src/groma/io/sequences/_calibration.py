@@ -21,6 +21,7 @@ from groma._typing import FloatArray, IntArray
 from groma.bounded.text import finite, read_text, whole
 from groma.errors import FileFormatError, InputError
 from groma.io.reading import reading
+from groma.io.sequences._yaml import yaml_entries, yaml_numbers
 from groma.io.sequences.frame import SequenceCamera, checked_params
 
 #: What callers may pass as a camera: a value, numbers, a line, or the name of a file.
@@ -32,8 +33,8 @@ FILE_NAMES = ("cameras.txt", "camera.txt", "calibration.txt", "calib.txt", "intr
 _BAND = 1 << 18
 
 _HELP = (
-    "expected 'fx fy cx cy', 'fx fy cx cy k1 k2 p1 p2 [k3]', a 3x3 matrix, or a line of COLMAP's cameras.txt "
-    "('1 PINHOLE 640 480 fx fy cx cy')"
+    "expected 'fx fy cx cy', 'fx fy cx cy k1 k2 p1 p2 [k3 [k4 k5 k6]]', a 3x3 or 4x4 matrix, a line of COLMAP's "
+    "cameras.txt ('1 PINHOLE 640 480 fx fy cx cy'), or a .yaml file of Kalibr, ROS or OpenCV"
 )
 
 
@@ -129,7 +130,38 @@ def calibration_of(camera: CameraLike) -> Calibration:
 def read_calibration(path: Path) -> Calibration:
     """Read a calibration from a file in one of the accepted forms."""
     with reading(path, "camera file"):
+        if path.suffix.lower() in (".yaml", ".yml"):
+            return calibration_in(yaml_entries(path), path)
         return _from_text(read_text(path), str(path))
+
+
+def calibration_in(entries: dict[str, str], path: Path) -> Calibration:
+    """Return the camera in the entries of a YAML file of EuRoC, Kalibr, ROS or OpenCV.
+
+    Raises
+    ------
+    FileFormatError
+        If it has none, or one of another model.
+    """
+    if "camera_matrix.data" in entries:
+        lens = "distortion_coefficients.data"
+        intrinsics = yaml_numbers(entries, "camera_matrix.data", path)[[0, 4, 2, 5]]
+        width, height = (entries.get(f"image_{side}", "") for side in ("width", "height"))
+        size = whole(width, f"{path}, image_width"), whole(height, f"{path}, image_height")
+    else:
+        intrinsics, resolution = yaml_numbers(entries, "intrinsics", path), yaml_numbers(entries, "resolution", path)
+        lens = "distortion_coeffs" if "distortion_coeffs" in entries else "distortion_coefficients"
+        size = int(resolution[0]), int(resolution[1])
+        if entries.get("camera_model", "pinhole") != "pinhole":
+            raise FileFormatError(f"{path}: camera_model must be pinhole; got {entries['camera_model']}.")
+    kind = entries.get("distortion_model", "radial-tangential")
+    distortion = yaml_numbers(entries, lens, path) if kind != "none" else np.zeros(0)
+    if kind in ("radial-tangential", "radtan", "none", "plumb_bob", "rational_polynomial"):
+        return from_opencv(np.append(intrinsics, distortion), size)
+    if kind in ("equidistant", "fisheye"):
+        center = intrinsics + np.array([0.0, 0.0, 0.5, 0.5])
+        return _checked("OPENCV_FISHEYE", np.append(center, distortion), size, str(path))
+    raise FileFormatError(f"{path}: distortion_model must be radial-tangential or equidistant; got {kind}.")
 
 
 def find_calibration(folder: Path) -> Calibration | None:
@@ -141,7 +173,7 @@ def find_calibration(folder: Path) -> Calibration | None:
 
 
 def from_opencv(numbers: npt.ArrayLike, size: tuple[int, int] | None = None) -> Calibration:
-    """Return the calibration for a 3x3 matrix, or fx, fy, cx, cy and none, 4 or 5 coefficients k1, k2, p1, p2, k3."""
+    """Return the calibration for a 3x3 matrix, or fx, fy, cx, cy and 0, 4, 5 or 8 coefficients k1, k2, p1 ..."""
     try:
         array = np.asarray(numbers, np.float64)
     except (TypeError, ValueError) as error:
@@ -166,20 +198,20 @@ def _from_text(text: str, source: str) -> Calibration:
             size = whole(words[1], wrong, "the width"), whole(words[2], wrong, "the height")
             return _checked(words[0], np.array(finite(words[3:], wrong)), size, source)
     numbers = np.array(finite((word for words in lines for word in words), wrong, _HELP.removeprefix("expected ")))
-    if len(lines) == 3 and len(numbers) == 9:
-        return _from_numbers(numbers[[0, 4, 2, 5]], source)
+    if len(lines) in (3, 4) and len(numbers) == len(lines) ** 2:  # ScanNet writes 4x4
+        return _from_numbers(numbers.reshape(len(lines), -1)[[0, 1, 0, 1], [0, 1, 2, 2]], source)
     return _from_numbers(numbers, source)
 
 
 def _from_numbers(numbers: FloatArray, source: str) -> Calibration:
-    if numbers.ndim != 1 or len(numbers) not in (4, 8, 9):
+    if numbers.ndim != 1 or len(numbers) not in (4, 8, 9, 12):
         raise InputError(f"{source} holds {numbers.size} numbers; {_HELP}.")
     params = numbers + np.array([0, 0, 0.5, 0.5, *[0] * (len(numbers) - 4)])
     if not params[4:].any():
         return _checked("PINHOLE", params[:4], None, source)
-    if len(params) == 8 or params[8] == 0.0:
+    if not params[8:].any():
         return _checked("OPENCV", params[:8], None, source)
-    return _checked("FULL_OPENCV", np.append(params, np.zeros(3)), None, source)
+    return _checked("FULL_OPENCV", np.append(params, np.zeros(12 - len(params))), None, source)
 
 
 def _checked(model: str, params: FloatArray, size: tuple[int, int] | None, source: str) -> Calibration:

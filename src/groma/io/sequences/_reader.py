@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from groma.bounded.images import decoded
 from groma.errors import FileFormatError, InputError
+from groma.io.depth_maps import at_size, has_proportions
 from groma.io.sequences._calibration import Calibration, Rectification, rectification
 from groma.io.sequences.frame import Frame, Kind, SequenceCamera
 from groma.io.trajectories import Trajectory
@@ -156,13 +157,14 @@ class FileSequence:
             remarks.append(f"{path.name}: {error}")
             return None
         width, height = self.file_size
-        if raw is None or raw.ndim != 2 or raw.shape != (height, width):
+        if raw is None or not has_proportions(raw.shape, self.file_size):
             what = "cannot be read" if raw is None else f"is {raw.shape[1]}x{raw.shape[0]}, not {width}x{height} grey"
             remarks.append(f"{path.name} {what}; the frame comes without.")
             return None
         if raw.dtype == np.uint8:  # a picture of depths; distances in so few steps would be taken for exact
             remarks.append(f"{path.name} has 8 bits, too few for distances (16 or floats); the frame comes without.")
             return None
+        raw = at_size(raw, self.file_size)
         depth = raw.astype(np.float32) * np.float32(1.0 / self.preparation.depth_scale)
         # 65535 stands for no value in some data; NaN in images of floats.
         bad = raw == 65535 if raw.dtype == np.uint16 else ~(np.isfinite(depth) & (depth > 0))

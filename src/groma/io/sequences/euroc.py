@@ -18,12 +18,13 @@ import numpy as np
 from groma import cameras
 from groma._typing import FloatArray
 from groma.bounded.names import listed_file
-from groma.bounded.text import finite, read_lines, whole
+from groma.bounded.text import read_lines, whole
 from groma.errors import FileFormatError, InputError
 from groma.geometry import se3
 from groma.io.reading import reading
-from groma.io.sequences._calibration import Calibration, from_opencv, rectification
+from groma.io.sequences._calibration import Calibration, calibration_in, rectification
 from groma.io.sequences._reader import Entry, FileSequence, Preparation, file_size, simple_sequence
+from groma.io.sequences._yaml import yaml_entries, yaml_numbers
 from groma.io.sequences.frame import SequenceCamera
 from groma.io.sequences.layouts import Wishes
 from groma.io.sequences.tum_rgbd import pair_by_time
@@ -124,54 +125,14 @@ def _sensor(folder: Path, calibration: Calibration | None) -> _Sensor:
     pose = np.eye(4)
     if path.is_file():
         with reading(path, "sensor.yaml"):
-            entries = _yaml(path)
-            pose = _numbers(entries, "data").reshape(4, 4)
+            entries = yaml_entries(path)
+            pose = yaml_numbers(entries, "T_BS.data", path).reshape(4, 4)
             if np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() > 1e-3:
-                raise FileFormatError("T_BS is not a rigid motion.")
-            calibration = calibration or _calibration(entries)
+                raise FileFormatError(f"{path}: T_BS is not a rigid motion.")
+            calibration = calibration or calibration_in(entries, path)
     if calibration is None:
         raise InputError(f"There is no {path}. Add it, or pass camera= and kind='mono'.")
     return _Sensor(calibration, pose, _images(folder))
-
-
-def _calibration(entries: dict[str, str]) -> Calibration:
-    intrinsics, resolution = _numbers(entries, "intrinsics"), _numbers(entries, "resolution")
-    distortion, size = _numbers(entries, "distortion_coefficients"), (int(resolution[0]), int(resolution[1]))
-    if entries.get("camera_model", "pinhole") != "pinhole":
-        raise FileFormatError(f"camera_model must be pinhole; got {entries['camera_model']}.")
-    kind = entries.get("distortion_model", "radial-tangential")
-    if kind in ("radial-tangential", "radtan", "none", "plumb_bob"):
-        return from_opencv(np.append(intrinsics, distortion), size)
-    if kind in ("equidistant", "fisheye"):
-        center = intrinsics + np.array([0.0, 0.0, 0.5, 0.5])
-        return Calibration("OPENCV_FISHEYE", np.append(center, distortion), size)
-    raise FileFormatError(f"distortion_model must be radial-tangential or equidistant; got {kind}.")
-
-
-def _yaml(path: Path) -> dict[str, str]:
-    """Return the scalars and the flow lists of a YAML file by key, whatever they are nested in."""
-    entries: dict[str, list[str]] = {}
-    key = None  # of a list that goes on
-    for _, line in read_lines(path):
-        if key is None:
-            name, colon, value = line.partition(":")
-            name = name.strip()
-            if not colon or not name:
-                continue
-            entries[name] = [value]
-            key = name if "[" in value else None
-        else:
-            entries[key].append(line)
-        if "]" in line:
-            key = None
-    return {name: " ".join(parts).strip() for name, parts in entries.items()}
-
-
-def _numbers(entries: dict[str, str], key: str) -> FloatArray:
-    if key not in entries:
-        raise FileFormatError(f"it has no entry {key}.")
-    words = entries[key].partition("[")[2].partition("]")[0].replace(",", " ").split()
-    return np.array(finite(words, key, "a list of finite numbers"))
 
 
 def _images(folder: Path) -> list[tuple[float, Path]]:

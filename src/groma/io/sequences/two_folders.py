@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Colour and depth in two folders without lists, as Open3D, ScanNet and recorders of depth cameras write them.
 
-Colour lies in ``rgb``, ``color``, ``image`` or ``images``, depth in ``depth``. Images whose names are seconds (as those
+Colour lies in ``rgb``, ``color``, ``image`` or ``images``, depth in ``depth``; or both in one folder, or ``results`` in
+it, where the names of depth images contain "depth" (Replica). Images whose names are seconds (as those
 of TUM RGB-D) are paired by time, others by the last number in their names.
 Numbers in files of integers are millimetres, or 1/5000 of a metre where names are seconds; floats are metres.
 """
@@ -32,13 +33,26 @@ DEPTH_SCALE = 1000.0
 
 def is_two_folders(folder: Path) -> bool:
     """Whether a folder has this layout."""
-    return bool(images_in(folder / DEPTH)) and any(images_in(folder / name) for name in COLOR)
+    return all(_images(folder))
+
+
+def _images(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Return the images of colour and of depth; none of either where a folder has another layout."""
+    depths = images_in(folder / DEPTH)
+    if depths and (colors := next((found for name in COLOR if (found := images_in(folder / name))), None)):
+        return colors, depths
+    for place in (folder, folder / "results"):
+        images = images_in(place)
+        depths = [path for path in images if DEPTH in path.stem.lower()]
+        colors = [path for path in images if DEPTH not in path.stem.lower()]
+        if depths and {_number(path) for path in depths} <= {_number(path) for path in colors}:
+            return colors, depths
+    return [], []
 
 
 def open_two_folders(folder: Path, wishes: Wishes) -> FileSequence:
     """Open a folder; see :func:`groma.io.sequences.open_sequence`."""
-    colors = next(found for name in COLOR if (found := images_in(folder / name)))
-    depths = images_in(folder / DEPTH)
+    colors, depths = _images(folder)
     calibration = camera_for(folder, wishes, folder, colors[0].parent)
     warnings: list[str] = []
     kind = wishes.selection.kind_of("rgbd")
