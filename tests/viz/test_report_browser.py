@@ -172,7 +172,7 @@ def test_points_planes_and_cameras_can_be_clicked(opened, scene):
     _only(page, "cameras")
     page.evaluate("eye.pivot = cameraCenter(1), draw()")
     _click(page, scene.cam_centers_in_world[1])
-    assert page.inner_text("#about h3").startswith("Second.jpg") and page.input_value("#image") == "1"
+    assert page.inner_text("#about h3").startswith("second.jpg") and page.input_value("#image") == "1"
     page.click("#about h3 button")
     assert page.evaluate("chosen") is None
 
@@ -221,6 +221,10 @@ def test_search_by_name(opened, scene):
     assert page.evaluate("[chosen.kind, chosen.index, current]") == ["camera", 1, 1]
     page.fill("#search", "line 99999")
     assert page.inner_text("#found") == "Nothing has this name."
+    assert page.inner_text("#about h3").startswith("second")
+    name = "00" + str(scene.lines.ids[3])  # the beginning of a file name, not the number of a line
+    page.evaluate("name => { cameras.names[0] = name + '.jpg'; }", name)
+    assert page.evaluate("name => search(name).map(found => found.kind)", name) == ["camera"]
     page.fill("#search", str(scene.points.ids[5]))
     kinds = page.evaluate("search($('search').value).map(found => found.kind)")
     assert "point" in kinds
@@ -313,6 +317,8 @@ def test_a_phone(opened, scene):
     _only(page, "lines")
     page.touchscreen.tap(*page.evaluate(WHERE, _in_page(page, _middle(scene, 1))))
     assert page.evaluate("[chosen.kind, chosen.index]") == ["line", 1]
+    hint = page.inner_text(".hint")
+    assert "Tap a line" in hint and "Keys" not in hint
     photo = page.locator("#photo").bounding_box()
     assert photo["y"] > box["y"] + box["height"] and photo["width"] > 300
 
@@ -396,3 +402,13 @@ def test_the_glide_follows_the_clock(opened):
     many, few = (page.evaluate(glides, list(range(10, 101, step))) for step in (10, 90))
     assert many == pytest.approx(few, abs=1e-9)
     assert many == pytest.approx(1 - np.exp(-100 / 67))
+
+
+def test_what_the_mouse_pointed_at_is_forgotten_when_the_view_moves(opened, scene):
+    page = opened()
+    _only(page, "lines")
+    page.mouse.move(*page.evaluate(WHERE, _in_page(page, _middle(scene, 2))))
+    page.wait_for_function("pointed && !document.getElementById('scene-tip').hidden")
+    page.fill("#search", f"line {scene.lines.ids[0]}")
+    page.press("#search", "Enter")
+    assert page.evaluate("pointed") is None and page.evaluate("document.getElementById('scene-tip').hidden")
