@@ -231,3 +231,8 @@ def test_compiling_is_announced_as_the_first_time_only_where_it_is_kept(own, sai
     monkeypatch.setattr(folder, "_own", own)
     Console(False, False, None)._announce_compilation()
     assert said in capsys.readouterr().out
+
+
+def test_a_percent_sign_stays_with_its_number():
+    assert style.wrapped("of the points 12 % are left", 17) == style.wrapped("of the points 12 % are left", 20)
+    assert style.wrapped("of the points ab 12 % left", 20) == "of the points ab\n  12 % left"

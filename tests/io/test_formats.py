@@ -317,12 +317,16 @@ def test_read_scene_says_what_it_wants(tmp_path):
     (tmp_path / "folder").mkdir()
     (tmp_path / "pictures").mkdir()
     (tmp_path / "pictures" / "a.JPG").touch()
+    (tmp_path / "maps" / "castle").mkdir(parents=True)
+    for name in ("castle.index.npz", "castle/cameras.bin"):
+        (tmp_path / "maps" / name).touch()
     for name, error, message in [
         ("nothing", InputError, "Cannot read"),
         ("picture.jpg", FileFormatError, "is not a scene"),
         ("empty.npz", FileFormatError, "groma archive"),
         ("folder", FileFormatError, "holds no COLMAP model: .* Check the path"),
         ("pictures", FileFormatError, "holds no COLMAP model: .* groma map"),
+        ("maps", FileFormatError, "It holds castle: pass .*castle, for example"),  # the index of a map is no scene
         ("bad\0name", InputError, "Cannot read"),
     ]:
         with pytest.raises(error, match=message):

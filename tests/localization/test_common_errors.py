@@ -227,3 +227,17 @@ def test_exact_calibrations_leave_errors_of_poses():
     found = refine(world.camera, world.matches, world.start(), max_errors(world.matches), gathered=True)
     less, more = (one.of_query(found, world.landmarks) for one in (posed, both))
     assert 0.0 < np.trace(less) < np.trace(more)
+
+
+@pytest.mark.kernels
+def test_two_images_are_enough():
+    """Two centres leave the rotation about the line through them free: the rotations of the poses settle it. What is
+    left is the motion between the two but for its length.
+    """
+    world = _map(0, num_images=3)
+    found, _ = common_errors(world.scene, world.scene, (1.0, 1.0), (True, False))
+    assert found is not None
+    extent = np.linalg.norm(np.diff(world.scene.cam_centers_in_world, axis=0))
+    size = np.tile([1.0, 1.0, 1.0, extent, extent, extent], 2)
+    values = np.linalg.eigvalsh(found.covariance * np.outer(size, size))
+    assert values[6] < 1e-6 * values[7] and values[7] > 0.0

@@ -254,8 +254,10 @@ def test_explanation_counts_the_lines_of_the_map_first():
     mapped = line_map({Outcome.MAPPED: 50, Outcome.NO_MATCH: 30}, num_lines=12)
     assert explain(mapped).startswith("12 lines from 50 of 80 segments in 1 image. Of the segments on no line: 30")
     assert explain(mapped, 5, 0.5).startswith(
-        "7 lines, of 12 from 50 of 80 segments in 1 image: 5 are left out, right with a probability below 0.5 "
-        "(--min-confidence). Of the segments on no line: 30"
+        "7 lines, of 12 from 50 of 80 segments in 1 image: 5, right with a probability below 0.5 "
+        "(--min-confidence), are left out. Of the segments on no line: 30"
     )
-    assert explain(mapped, 11, 0.8).startswith("1 line, of 12 from 50 of 80 segments in 1 image: 11 are left out")
-    assert ": 1 is left out" in explain(mapped, 1, 0.8)
+    assert explain(mapped, 11, 0.8).startswith(
+        "1 line, of 12 from 50 of 80 segments in 1 image: 11, right with a probability below 0.8 "
+    )
+    assert "(--min-confidence), is left out" in explain(mapped, 1, 0.8)

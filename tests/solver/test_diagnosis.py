@@ -159,7 +159,7 @@ CASES = [
             np.vstack([looking([[0.006 * x, -6.0, 0.006 * z]], [x, 0, z]) for x in (-1, 0, 1) for z in (-0.5, 0.5)]),
             CLOUD,
         ),
-        "pure_rotation", ["hardly move", "0.1% of the viewing distance", "all 40 points"],
+        "pure_rotation", ["hardly move", "0.1 % of the viewing distance", "all 40 points"],
     ),
     (
         "one camera", lambda: problem_of(looking([[0, -6.0, 0]], ORIGIN), CLOUD), "point_seen_once",

@@ -53,6 +53,7 @@ def test_bars_show_the_worst_first_and_escape_names():
     tree = _tree(svg)
     shown = [text.text for text in tree.iter("text") if text.text in names]
     assert shown == ["good.jpg", "<b>bad</b>"]
+    assert "1.000 → 0.900" in svg and "2.000 → 0.500" in svg  # the same decimals before and after
 
 
 def test_bars_of_nothing():

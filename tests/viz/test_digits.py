@@ -40,6 +40,10 @@ def test_large_numbers_are_short(values, shown):
     assert _digits.short(values) == shown
 
 
+def test_everything_is_a_hundred_per_cent():
+    assert [_digits.percent(share) for share in (1.0, 0.996, 0.99, 0.0873)] == ["100 %", "100 %", "99 %", "8.7 %"]
+
+
 @pytest.mark.parametrize("extent", [1e-9, 0.7, 1.0, 3.0, 4999.0, 1e12])
 @pytest.mark.parametrize("most", [4, 5, 8])
 def test_steps_are_round_and_not_too_many(extent, most):

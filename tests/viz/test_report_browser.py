@@ -172,7 +172,7 @@ def test_points_planes_and_cameras_can_be_clicked(opened, scene):
     _only(page, "cameras")
     page.evaluate("eye.pivot = cameraCenter(1), draw()")
     _click(page, scene.cam_centers_in_world[1])
-    assert page.inner_text("#about h3").startswith("Second.jpg") and page.input_value("#image") == "1"
+    assert page.inner_text("#about h3").startswith("second.jpg") and page.input_value("#image") == "1"
     page.click("#about h3 button")
     assert page.evaluate("chosen") is None
 
@@ -211,9 +211,10 @@ def test_search_by_name(opened, scene):
     # A few of the names that go on after what is typed, and first.jpg, second.jpg.
     assert page.evaluate("search('p').map(found => found.kind)") == ["plane", *["point"] * 7, "camera", "camera"]
     size = page.locator("#scene").bounding_box()
+    page.evaluate("pointAt({ kind: 'line', index: 2 })")
     page.fill("#search", f"line {scene.lines.ids[3]}")
     page.press("#search", "Enter")
-    assert page.evaluate("[chosen.kind, chosen.index]") == ["line", 3]
+    assert page.evaluate("[chosen.kind, chosen.index, pointed]") == ["line", 3, None]  # the view has moved
     assert page.evaluate("eye.distance / lines.lengths[3]") < 5.001  # from near
     assert page.locator("#scene").bounding_box() == size  # the panel scrolls
     page.fill("#search", "second")
@@ -221,9 +222,9 @@ def test_search_by_name(opened, scene):
     assert page.evaluate("[chosen.kind, chosen.index, current]") == ["camera", 1, 1]
     page.fill("#search", "line 99999")
     assert page.inner_text("#found") == "Nothing has this name."
-    page.fill("#search", str(scene.points.ids[5]))
-    kinds = page.evaluate("search($('search').value).map(found => found.kind)")
-    assert "point" in kinds
+    name = f"00{scene.lines.ids[3]}"  # the beginning of a file name, not the number of a line
+    assert page.evaluate("n => { cameras.names[0] = n; return search(n)[0].kind; }", name) == "camera"
+    assert "point" in page.evaluate("id => search(id).map(found => found.kind)", str(scene.points.ids[5]))
 
 
 def _measured(page) -> dict[str, str]:
@@ -313,6 +314,7 @@ def test_a_phone(opened, scene):
     _only(page, "lines")
     page.touchscreen.tap(*page.evaluate(WHERE, _in_page(page, _middle(scene, 1))))
     assert page.evaluate("[chosen.kind, chosen.index]") == ["line", 1]
+    assert page.inner_text(".hint").startswith("Tap") and not page.is_visible(".by-mouse")
     photo = page.locator("#photo").bounding_box()
     assert photo["y"] > box["y"] + box["height"] and photo["width"] > 300
 

@@ -223,7 +223,7 @@ def test_colours_of_lines_change(view):
 
 
 def test_looking_from_a_photograph(view):
-    camera = SimpleNamespace()
+    camera = SimpleNamespace(image_width=1400, image_height=700)
     client = SimpleNamespace(camera=camera, atomic=contextlib.nullcontext)
     view.look_from.value = "2: second.jpg"
     view._move_to_camera(SimpleNamespace(client=client))
@@ -234,6 +234,15 @@ def test_looking_from_a_photograph(view):
     view._move_to_camera(SimpleNamespace(client=client))
     np.testing.assert_array_equal(camera.position, view.content.start_position)
     assert view.server.scene.get_handle_by_name("/cameras/1").visible
+
+
+def test_a_narrow_window_shows_the_whole_scene(view):
+    """The view is made for a scene 0.83 / 0.6 times as wide as high."""
+    start = view.content.start_position
+    for size, away in (((1400, 700), 1.0), ((1120, 800), 0.83 / 0.6), ((400, 800), 0.83 / 0.6 / 0.5)):
+        camera = SimpleNamespace(image_width=size[0], image_height=size[1], position=start)
+        view._look_from_outside(SimpleNamespace(camera=camera))
+        np.testing.assert_allclose(camera.position, away * start)
 
 
 def test_a_click_lists_the_observations(view):

@@ -114,8 +114,8 @@ class Motions:
             share = float(self.redundancy[:, part].mean())
             if share < NORMAL.majority:
                 told.append(
-                    f"The {name} of the cameras during the readout rest by {1.0 - share:.0%} on what is expected of "
-                    "them, not on the images."
+                    f"The {name} of the cameras during the readout rest by {100 * (1.0 - share):.0f} % on what is "
+                    "expected of them, not on the images."
                 )
         return tuple(told)
 

@@ -28,7 +28,7 @@ from groma.geometry import quaternion, se3
 from groma.localization.features import DescribedPoints, unit
 from groma.localization.matching import match_descriptors
 from groma.localization.pose.camera import QueryCamera
-from groma.localization.pose.records import LANDMARK_LOSS, landmark_covariances, residual_squares
+from groma.localization.pose.records import LANDMARK_LOSS, landmark_covariances, landmark_rows, residual_squares
 from groma.scene import PointObservations, Points, Scene
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
@@ -156,7 +156,8 @@ def _points(scene: Scene, seen: _Observed, straight: FloatArray, count: int) -> 
         )
         problem = solve(with_loss(assemble(posed, _ASSEMBLY).problem, loss), _SOLVER).problem
         xyz = problem.variables["points"].ambient()
-        order = np.concatenate([_rows_of(factor, seen, scene) for factor in problem.factors])
+        of_points = (factor for factor in problem.factors if landmark_rows(factor, "points") is not None)
+        order = np.concatenate([_rows_of(factor, seen, scene) for factor in of_points])
         squares = np.empty(len(seen.row))
         squares[order] = residual_squares(problem, "points", len(order))
         scale = noise_of(squares) ** 2

@@ -99,7 +99,7 @@ def motion_that_may_be_turning(scene: Scene, free: bool | None, inliers: Mapping
     length = unpack(found.x)[0][most] * seen.half[most]
     return (
         f"The camera may only have turned: without any motion, and with a focal length of {length:,.0f} instead of "
-        f"{scene.cameras.params[seen.cameras[most]][0]:,.0f} pixels, {fits:.0%} of the observations fit to "
+        f"{scene.cameras.params[seen.cameras[most]][0]:,.0f} pixels, {100 * fits:.0f} % of the observations fit to "
         f"{GATES.limit * limit_px:.2g} px. Focal length, places of cameras and depths may be wrong by far more than "
         "their deviations say. Add photographs from other places, or give the calibration."
     )

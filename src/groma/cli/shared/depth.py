@@ -57,7 +57,9 @@ def say_depth(console: Console, numbers: dict[str, Any]) -> None:
     what = f"{counted(numbers['num_point_depths'], 'depths')} of points in {counted(numbers['num_maps'], 'maps')}"
     middle, sigma = numbers["median_depth"], numbers["sigma_at_median"]
     if numbers["unit"] == "relative":
-        console.say(f"Depth up to scale: {what}, good to {sigma / middle:.1%}. A scale of each map was estimated.")
+        console.say(
+            f"Depth up to scale: {what}, good to {100 * sigma / middle:.1f} %. A scale of each map was estimated."
+        )
         return
     unit = "" if numbers["scale"] == 1.0 else f" (1 unit of the model was {numbers['scale']:.4g})"
     console.say(

@@ -42,14 +42,14 @@ def terminal_width() -> int:
 
 
 def wrapped(text: str, width: int) -> str:
-    """Return the text wrapped between words, continuation lines indented."""
+    """Return the text wrapped between words, but not before a percent sign; continuation lines indented."""
     lines = []
-    for line in text.split("\n"):
+    for line in text.replace(" %", "\0%").split("\n"):
         indent = re.match(" *", line)[0]  # type: ignore[index]
         lines += textwrap.wrap(
             line, max(width, 20), subsequent_indent=f"{indent}  ", break_long_words=False, break_on_hyphens=False
         ) or [""]
-    return "\n".join(lines)
+    return "\n".join(lines).replace("\0%", " %")
 
 
 def aligned(

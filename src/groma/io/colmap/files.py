@@ -106,14 +106,14 @@ def _num_images(place: Path) -> int:
 def _remedy(root: Path) -> str:
     """Say what to do with a folder without a model, by what else is in it."""
     names = sorted(entry.name for entry in root.iterdir()) if root.is_dir() else []
-    archives = [name for name in names if name.lower().endswith(".npz")]
+    archives = [name for name in names if name.lower().endswith(".npz") and not name.lower().endswith(".index.npz")]
     models = [
         name for name in names if (root / name / "cameras.bin").is_file() or (root / name / "cameras.txt").is_file()
     ]
     if missing := _are_missing(_missing(root)) or missing_from_parts(root):
         return f"{missing}: fetch or export it again."
     if archives or models:
-        return f"It holds {' and '.join((archives + models)[:3])}: pass {root / (archives + models)[0]}, for example."
+        return f"It holds {', '.join((archives + models)[:3])}: pass {root / (archives + models)[0]}, for example."
     if any(name.lower().endswith(IMAGES) for name in names):
         return "It holds images: groma map makes a model of them."
     return "Check the path."

@@ -14,8 +14,9 @@ and all landmarks of a query at once: nothing is averaged out. What the query is
 
 where :math:`\delta c` is there if the query has the calibration of a camera of the map, whose error it shares. Its
 covariance grows by :math:`K \Sigma_\theta K^\top`. :math:`\Sigma_\theta` is that of the adjustment of the map by its
-points and lines, landmarks eliminated, in the frame in which the camera centres vary least together: errors of a query
-are relative to the map. What the observations do not know, such as a lens of another model, is not in it.
+points and lines, landmarks eliminated, in the frame in which the camera centres (and rotations, if the centres are on a
+line) vary least together: errors of a query are relative to the map. What the observations do not know, such as a lens
+of another model, is not in it.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.stages import STAGES, with_loss
-from groma.errors import ProblemError
+from groma.errors import InputError
 from groma.factors.losses import GemanMcClure
 from groma.gates import gate
 from groma.localization.errors.held_poses import held_poses
@@ -185,7 +186,7 @@ def common_errors(
     )
     try:
         covariance = _of_estimated(bare, estimated) if any(estimated) else np.zeros((6 * frames, 6 * frames))
-    except ProblemError:
+    except InputError:  # not even what the cameras see and where they are determines a frame
         return None, beyond
     points = views_of(described.keep(lines=[], planes=[], directions=[]), "points", count)
     if not estimated[0]:
@@ -206,8 +207,13 @@ def _of_estimated(scene: Scene, estimated: tuple[bool, bool]) -> FloatArray:
         refine_poses=estimated[0], refine_intrinsics=estimated[1], refine_principal_point=None, gauge="free"
     )
     problem = with_loss(assemble(scene, options).problem, GemanMcClure(STAGES.last_scale))
-    datum = {"frames": [1, 1, 1, 0, 0, 0]} if estimated[0] else None
-    found = Covariances(problem, "inner" if estimated[0] else "held", datum=datum)
+    if not estimated[0]:
+        return Covariances(problem, "held").joint(_variables(scene, estimated[1]))
+    try:
+        found = Covariances(problem, "inner", datum={"frames": [1, 1, 1, 0, 0, 0]})
+    except InputError:  # centres on a line leave the rotation about it free: turns count as far as the line is long
+        turn = np.ptp(scene.cam_centers_in_world, axis=0).max() ** 2
+        found = Covariances(problem, "inner", datum={"frames": [1, 1, 1, turn, turn, turn]})
     return found.joint(_variables(scene, estimated[1]))
 
 

@@ -73,6 +73,6 @@ def shifted_maps(measured: FloatArray, predicted: FloatArray, width: float) -> l
     where = where or f"by about {abs(y):.0f} pixels {'down' if y > 0.0 else 'up'}"
     return [
         f"The depth maps fit the photographs better when shifted {where}: the deviations of depths fall by "
-        f"{1.0 - least:.0%}. They may be those of another camera, and then bend the map. Register them to the "
-        "photographs, or leave them out."
+        f"{100 * (1.0 - least):.0f} %. They may be those of another camera, and then bend the map. Register them to "
+        "the photographs, or leave them out."
     ]

@@ -60,8 +60,8 @@ def common_unit(ratio: FloatArray, image_idx: IntArray, known: bool) -> tuple[fl
     scatter = _spread(own)
     if scatter > UNITS.different:
         warnings.append(
-            f"The depth maps do not agree on a unit: their scales differ by {np.expm1(scatter):.0%} from map to map. "
-            "If each was guessed from its photograph alone, pass --relative-depth."
+            f"The depth maps do not agree on a unit: their scales differ by {100 * np.expm1(scatter):.0f} % from map "
+            "to map. If each was guessed from its photograph alone, pass --relative-depth."
         )
     if known and abs(np.log(unit)) > UNITS.known:
         raise InputError(

@@ -97,9 +97,9 @@ def explain(line_map: LineMap, num_left_out: int = 0, min_confidence: float = 0.
     head = f"{_lines(line_map.num_lines)} {source}."
     if num_left_out:
         head = (
-            f"{_lines(line_map.num_lines - num_left_out)}, of {line_map.num_lines:,} {source}: {num_left_out:,} "
-            f"{'is' if num_left_out == 1 else 'are'} left out, right with a probability below {min_confidence:g} "
-            "(--min-confidence)."
+            f"{_lines(line_map.num_lines - num_left_out)}, of {line_map.num_lines:,} {source}: {num_left_out:,}, "
+            f"right with a probability below {min_confidence:g} (--min-confidence), "
+            f"{'is' if num_left_out == 1 else 'are'} left out."
         )
     lost = sorted(((n, outcome) for outcome, n in counts.items() if outcome > Outcome.RECOVERED and n), reverse=True)
     if not lost:

@@ -155,8 +155,8 @@ def _general_findings(landmarks: _Landmarks, rest: BoolArray) -> list[Finding]:
     )  # fmt: skip
     findings += landmarks.finding(
         f"{landmarks.kind}_weak", "warning", landmarks.shaky,
-        f"is weak: uncertain by more than {DIAGNOSIS.weak:.0%} of the distance",
-        f"are weak: uncertain by more than {DIAGNOSIS.weak:.0%} of the distance",
+        f"is weak: uncertain by more than {100 * DIAGNOSIS.weak:.0f} % of the distance",
+        f"are weak: uncertain by more than {100 * DIAGNOSIS.weak:.0f} % of the distance",
         "Views from farther apart would help.",
     )  # fmt: skip
     return findings
@@ -190,8 +190,9 @@ def _only_turning(kind: str, seen: Observers, rest: BoolArray, shaky: BoolArray)
         text = f"The cameras only turn: their centres are in one place, so the depth of {kind}s is not determined."
     elif spread < DIAGNOSIS.edge_on and affected > 0.5 * len(rest):
         text = (
-            f"The cameras hardly move: their centres are within {spread:.1%} of the viewing distance, and the depth of "
-            f"{_so_many(kind, affected, len(rest))} is not determined or uncertain by more than {DIAGNOSIS.weak:.0%}."
+            f"The cameras hardly move: their centres are within {100 * spread:.1f} % of the viewing distance, and the "
+            f"depth of {_so_many(kind, affected, len(rest))} is not determined or uncertain by more than "
+            f"{100 * DIAGNOSIS.weak:.0f} %."
         )
     else:
         return None

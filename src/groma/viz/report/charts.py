@@ -67,14 +67,14 @@ def histogram(before: FloatArray | None, after: FloatArray) -> str:
         bars = [
             f'<rect x="{_LEFT + i * width:.1f}" y="{bottom - s / top * (bottom - _TOP):.1f}" width="{width - 0.6:.1f}" '
             f'height="{s / top * (bottom - _TOP):.1f}"><title>{limits[i]} to {limits[i + 1]} px: '
-            f"{100 * s:.2g} % {name}</title></rect>"
+            f"{_digits.percent(s)} {name}</title></rect>"
             for i, s in enumerate(share)
             if s > 0
         ]
         body.append(f'<g class="{name}" opacity="0.62">{"".join(bars)}</g>')
     body.append(line(_LEFT, bottom, WIDTH - _RIGHT, bottom, "axis"))
     body.append(text((_LEFT + WIDTH) / 2, HEIGHT - 5, "length of a residual, pixels"))
-    body.append(text(_LEFT - 8, _TOP + 10, f"{100 * top:.2g} %", "end") + text(_LEFT - 8, bottom, "0", "end"))
+    body.append(text(_LEFT - 8, _TOP + 10, _digits.percent(top), "end") + text(_LEFT - 8, bottom, "0", "end"))
     return svg("Histogram of residuals", body)
 
 
@@ -172,7 +172,8 @@ def bars(names: Sequence[str], before: FloatArray | None, after: FloatArray) -> 
     labels = [name if len(name) <= 26 else "…" + name[-25:] for name in names]
     left, right = 14 + 7 * max((len(labels[index]) for index in order), default=0), 104
     values = after if before is None else np.concatenate([before, after])
-    told = [_digits.even(series[order].tolist()) for series in (before, after) if series is not None]
+    series_shown = [series[order] for series in (before, after) if series is not None]
+    told = np.array(_digits.even(np.concatenate(series_shown).tolist())).reshape(len(series_shown), -1)
     finite = values[np.isfinite(values)]
     # One image that is far off at the start must not flatten all the others.
     top = min(float(finite.max()), 4 * float(np.median(finite))) if len(finite) else 1.0
@@ -216,8 +217,8 @@ def tracks(lengths: Mapping[str, IntArray]) -> str:
     for number, (kind, share) in enumerate(shares.items()):
         bars = "".join(
             f'<rect x="{_LEFT + place * step + 1.5 + number * width:.1f}" y="{bottom - height:.1f}" '
-            f'width="{width:.1f}" height="{height:.1f}"><title>{100 * value:.2g} % of the {kind} in {first + place}'
-            f"{' or more' if first + place == last else ''} images</title></rect>"
+            f'width="{width:.1f}" height="{height:.1f}"><title>{_digits.percent(value)} of the {kind} in '
+            f"{first + place}{' or more' if first + place == last else ''} images</title></rect>"
             for place, value in enumerate(share)
             if (height := value / top * (bottom - _TOP)) > 0
         )
@@ -230,7 +231,7 @@ def tracks(lengths: Mapping[str, IntArray]) -> str:
         body.append(text(_LEFT + (place + 0.5) * step, bottom + 16, f"{first + place}{more}"))
     body.append(line(_LEFT, bottom, WIDTH - _RIGHT, bottom, "axis"))
     body.append(text((_LEFT + WIDTH) / 2, HEIGHT - 5, "images that observe it"))
-    body.append(text(_LEFT - 8, _TOP + 10, f"{100 * top:.2g} %", "end") + text(_LEFT - 8, bottom, "0", "end"))
+    body.append(text(_LEFT - 8, _TOP + 10, _digits.percent(top), "end") + text(_LEFT - 8, bottom, "0", "end"))
     return svg("Landmarks by the number of images that observe them", body)
 
 

@@ -37,6 +37,11 @@ def _with_unit(value: float) -> str:
     return f"{value:.3g}"
 
 
+def percent(share: float) -> str:
+    """Return a share in per cent, with two digits."""
+    return f"{100 * share:.2g} %" if share < 0.995 else "100 %"
+
+
 def tick(value: float) -> str:
     """Return a number beside an axis of any range."""
     if value == 0:

@@ -45,7 +45,7 @@ _OUTCOMES = {
 _STATISTICS: dict[str, Callable[[FloatArray], Any]] = {
     "rms": lambda values: np.sqrt(np.mean(values**2)),
     "median": np.median,
-    "95 of 100 below": lambda values: np.percentile(values, 95),
+    "95th percentile": lambda values: np.percentile(values, 95),
     "largest": np.max,
 }
 
@@ -208,7 +208,7 @@ def contributions_card(entries: Sequence[Mapping[str, Any]] | None) -> str:
             [(head[entries.index(entry)], entry[field], entry["center_sigma"] if against else None) for entry in shown],
             f"distance of the camera centres from {whence}",
         )
-        key = " Box: the middle half of the cameras, line: from 5 to 95 of 100."
+        key = " Box: the middle half of the cameras, line: from the 5th to the 95th percentile."
         if against and any(entry["center_sigma"] is not None for entry in shown):
             key = key.removesuffix(".") + ", ring: predicted."
     caption = (
@@ -247,7 +247,7 @@ def _residual_table(before: Drawable | None, after: Drawable) -> str:
         rows.append(["not visible from their camera", *(f"{count:,}" for count in unseen)])
     caption = "Residuals of all observations. The rms counts wrong matches in full; the median does not notice them."
     if any(name == "line ends" for name in after.residual_kinds):
-        caption += " Each end of a segment counts by itself; the terminal and the summary take both ends together."
+        caption += " The two ends of a segment count separately; the terminal and the summary take them together."
     if before is not None:
         caption += " Kinds that are adjusted together share what is left: one may grow while the robust cost falls."
     return table("Numbers", caption, ["", *columns], rows) if rows else ""

@@ -158,7 +158,8 @@ def _tiles(track: Track, scores: TrajectoryScores | None) -> str:
     known = sum(count for status, count in statuses.items() if status in ("tracked", "found", "weak"))
     cells = [(f"{known:,} <i>of</i> {sum(statuses.values()):,}", "frames with a pose")] if statuses else []
     if scores is not None:
-        cells.append((f"{scores.ate.rmse:.4g}", f"position error (rms), over {scores.path_length:.4g}"))
+        label = f"position error (rms) on a path of {scores.path_length:.3g}, units of the reference"
+        cells.append((f"{scores.ate.rmse:.3g}", label))
     else:
         length = np.linalg.norm(np.diff(track.trajectory.world_from_cam[:, 4:], axis=0), axis=1).sum()
         cells.append(
@@ -167,7 +168,7 @@ def _tiles(track: Track, scores: TrajectoryScores | None) -> str:
     total = numbers.get("milliseconds", {}).get("total")
     if total:
         median, high = _digits.even([total["median"], total["p95"]])
-        cells.append((f"{median} ms", f"per frame, median; 95 of 100 below {high} ms"))
+        cells.append((f"{median} ms", f"per frame, median; 95th percentile {high} ms"))
     cells += [(f"{len(track.keyframes):,}", "keyframes"), (f"{numbers.get('loops', 0):,}", "loops closed")]
     return _page_tables.as_tiles(cells)
 
@@ -265,11 +266,13 @@ def _stage_table(track: Track) -> str:
     stages = track.statistics.get("milliseconds", {})
     if not stages:
         return ""
+    ordered = sorted(stages.items(), key=lambda item: (item[0] == "total", -item[1]["median"]))
+    median, high = (_digits.even([spent[key] for _, spent in ordered]) for key in ("median", "p95"))
     rows = [
-        [name.replace("_", " "), f"{spent['median']:.2f}", f"{spent['p95']:.2f}", f"{spent['frames']:,}"]
-        for name, spent in sorted(stages.items(), key=lambda item: (item[0] == "total", -item[1]["median"]))
+        [name.replace("_", " "), median[row], high[row], f"{spent['frames']:,}"]
+        for row, (name, spent) in enumerate(ordered)
     ]
-    head = ["stage", "median, ms", "95 of 100 below, ms", "frames"]
+    head = ["stage", "median, ms", "95th percentile, ms", "frames"]
     return _page_tables.table("Stages", "Time of the stages of a frame, where they took place.", head, rows)
 
 

@@ -40,6 +40,8 @@ _CAMERAS = (150, 156, 164)
 _MANY_CAMERAS = 100
 #: Colour of junctions, and their size over that of the scene.
 _JUNCTION, _JUNCTION_SIZE = (200, 40, 120), 0.008
+#: Width of the panel beside the scene, pixels; in windows that are higher than wide it lies over it.
+_PANEL = 320
 #: What is shown on request.
 _OFF_AT_FIRST = ("directions", "junctions")
 
@@ -84,6 +86,7 @@ class SceneView:
             self.draw_points()
             self.draw_lines()
         server.scene.on_click()(self._clicked)
+        server.on_client_connect(self._look_from_outside)
 
     # ------------------------------------------------------------------------------------------------------- Panel
 
@@ -314,6 +317,13 @@ class SceneView:
             self.server.scene.remove_by_name("/selection")
             self.selection.content = _view_words.note(_view_words.HINT)
 
+    def _look_from_outside(self, client: Any) -> None:
+        """Move the view to where it begins; farther away in a window that is less wide than the view expects."""
+        camera = client.camera
+        wide = camera.image_width - (_PANEL if camera.image_width > camera.image_height else 0)
+        away = max(1.0, framing.OPENING[0] / framing.OPENING[1] * camera.image_height / wide)
+        camera.position, camera.look_at = away * self.content.start_position, np.zeros(3)
+
     def _move_to_camera(self, event: Any) -> None:
         """Move the view to the pose of a photograph, or back."""
         if event.client is None:
@@ -325,7 +335,7 @@ class SceneView:
         self.shown["cameras"].value = image < 0
         with event.client.atomic():
             if image < 0:
-                camera.position, camera.look_at = self.content.start_position, np.zeros(3)
+                self._look_from_outside(event.client)
                 camera.up_direction, camera.fov = np.array([0.0, 0.0, 1.0]), OPENING
             else:
                 camera.wxyz = self.content.camera_wxyz[image]

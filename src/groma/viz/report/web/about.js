@@ -25,14 +25,14 @@ function gapAt(junction) { // twice the way from the place to the lines, which i
 // Rows of a thing: name, and text or links; empty ones are left out.
 function facts({ kind, index: i }) {
   if (kind === "line") return [
-    ["Length", number(lines.lengths[i])], ["Deviation", change(states[0].lineErrors[i], now.lineErrors[i]) + " rms"],
+    ["Length", number(lines.lengths[i])], ["Residual", change(states[0].lineErrors[i], now.lineErrors[i]) + " rms"],
     ["Images", lines.images[i]], ["Confidence", lines.confidence[i] >= 0 ? number(+lines.confidence[i].toPrecision(3)) : ""],
     ["Direction", lines.direction[i] >= 0 ? link({ kind: "direction", index: lines.direction[i] }) : ""],
     ["On planes", links("plane", planesOfLine(i))], ["Points on it", links("point", pointsOnLine(i))], ["Meets", links("line", linesMet(i))],
     ["Standard deviation", lineSigma(i)],
   ];
   if (kind === "point") return [
-    ["Deviation", change(states[0].errors[i], now.errors[i]) + " rms"], ["Images", points.images[i]],
+    ["Residual", change(states[0].errors[i], now.errors[i]) + " rms"], ["Images", points.images[i]],
     ["On planes", links("plane", planesOfPoint(i))], ["On lines", links("line", linesOfPoint(i))],
     ["Position", place("points", i).map((x, k) => number(+(x + data.offset[k]).toPrecision(7))).join(", ")],
     ["Standard deviation", pointSigma("points", i)],
@@ -48,7 +48,7 @@ function facts({ kind, index: i }) {
   if (kind === "direction") return [["Lines along it", links("line", linesAlong(i), 12)]];
   const entry = data.images[entryOfCamera[i]];
   return [
-    ["Deviation", entry ? change(entry.rms[0], entry.rms[last]) + " rms" : ""], ["Lines seen", entry ? entry.lines_seen.toLocaleString("en") : "none"],
+    ["Residual", entry ? change(entry.rms[0], entry.rms[last]) + " rms" : ""], ["Lines seen", entry ? entry.lines_seen.toLocaleString("en") : "none"],
     ["Points seen", entry ? entry.points_seen.toLocaleString("en") : "none"], ["Standard deviation", pointSigma("centers", i)],
   ];
 }
@@ -69,13 +69,13 @@ function showAbout() {
   const box = $("about");
   if (measuring) { box.replaceChildren(...measureRows()); return; }
   if (!chosen) {
-    box.replaceChildren(element("p", "Nothing is chosen. Click a line, point, plane or camera in the scene, or a segment in a photograph."));
+    box.replaceChildren(element("p", "Nothing is selected. Click a line, point, plane or camera in the scene, or a segment in a photograph."));
     return;
   }
   const list = facts(chosen).filter(([, value]) => value !== "" && value !== null && !(Array.isArray(value) && !value.length));
-  const title = nameOf(chosen), table = sightings(chosen);
+  const title = nameOf(chosen), first = chosen.kind === "camera" ? title[0] : title[0].toUpperCase(), table = sightings(chosen);
   box.replaceChildren(
-    element("h3", [title[0].toUpperCase() + title.slice(1), element("button", "×", { type: "button", title: "Let go (Esc)", onclick: () => choose(null) })]),
+    element("h3", [first + title.slice(1), element("button", "×", { type: "button", title: "Clear the selection (Esc)", onclick: () => choose(null) })]),
     element("dl", list.flatMap(([name, value]) => [element("dt", name), element("dd", typeof value === "number" ? String(value) : value)])), ...(table ? [table] : []),
   );
 }
@@ -88,7 +88,7 @@ function search(text) {
   if (!words) return found;
   const kinds = match ? [["line", lines], ["plane", planes], ["point", points], ["direction", directions]].filter(([kind]) => kind.startsWith(match[1])) : [];
   for (const [kind, table] of kinds) {
-    const index = match[2] ? table.ids.indexOf(+match[2]) : -1;
+    const index = String(+match[2]) === match[2] ? table.ids.indexOf(+match[2]) : -1; // 0042 is part of a file name
     if (index >= 0) found.push({ kind, index });
   }
   if (match && match[1]) for (const [kind, table] of kinds)

@@ -80,7 +80,7 @@ function measured([a, b]) {
   return found;
 }
 function measureRows() {
-  const said = picks.length === 0 ? "Click a first thing in the scene: a point, a line (its ends attract), a plane or a camera." : picks.length === 1 ? "Click a second thing." : "";
+  const said = picks.length === 0 ? "Click a point, a line (its ends attract), a plane or a camera in the scene." : picks.length === 1 ? "Click a second one." : "";
   const names = picks.map((thing, k) => [k ? "To" : "From", nameOf(thing)]);
   const values = picks.length === 2 ? measured(picks) : [];
   const units = values.length ? [element("p", "Lengths in scene units." + (covariances ? " ±: one standard deviation, the two taken as independent." : ""))] : [];

@@ -222,5 +222,8 @@ canvas.addEventListener("keydown", e => {
   else return;
   e.preventDefault(); draw();
 });
-onChoice.push(() => { renderer.light(lit); draw(); });
+onChoice.push(from => {
+  if (from === "search" || from === "link") pointAt(null); // what was under the mouse has moved away
+  renderer.light(lit); draw();
+});
 onPointed.push(() => { if (!pointed) $("scene-tip").hidden = true; draw(); });
