@@ -30,7 +30,6 @@ from groma.localization.pose.verdict import (
     Instead,
     Shown,
     Status,
-    Verdict,
     doubted_if_mirrored,
     doubted_if_missing,
     doubted_if_other_lens,
@@ -262,13 +261,14 @@ def pose_from_matches(
     other = _rival(matches, best, options, places, first) if options.look_for_rival and first.significant else None
     here, there, others = weighed(found, other, near if guided else None, matches, expected is not None, of_map.telling)
     asked = asked if here is found else partial(mirror, here.own)
-    return _judged(here, others, None if there is None else there.best.pose, asked, options, of_map)
+    return _judged(here, others, None if there is None else there.best.pose, matches, asked, options, of_map)
 
 
 def _judged(
     here: Place,
     others: list[Instead],
     rival: FloatArray | None,
+    matches: Matches,
     mirrored: Callable[[], tuple[Refined, IntArray] | None],
     options: PoseOptions,
     of_map: MapQuestions,
@@ -283,8 +283,10 @@ def _judged(
         verdict = doubted_if_missing(verdict, here.shown.parts, here.shown.missing)
     if of_map.mirror is not None and verdict.status == "localized" and (other := mirrored()) is not None:
         verdict = doubted_if_mirrored(verdict, *of_map.mirror.closest(best, used, *other))
-    if not options.refine_lens and verdict.status == "localized":
-        verdict = doubted_if_other_lens(verdict, lens_step(best, used, _errors(used, options), of_map.common))
+    # By what was matched without the pose, too: what was looked for near a wrong one may be what agrees with its lens.
+    for fit, of in [(best, used)] + [(here.own, matches)] * (used is not matches):
+        if not options.refine_lens and verdict.status == "localized":
+            verdict = doubted_if_other_lens(verdict, lens_step(fit, of, _errors(of, options), of_map.common))
     failed = verdict.status == "failed"
     return AbsolutePose(
         verdict.status,
