@@ -66,6 +66,8 @@ class PoseOptions:
 #: Of so many points of a mirror image one is matched first: of the most that leave so many votes, or else of the least
 #: (cost: fewer tell too little where a place repeats).
 _SOME, _VOTES = (8, 4, 2), 12
+#: Without the principal point, which few matches, some of them wrong, do not tell (convention).
+_FOCAL_LENGTH = replace(VERDICT, shift=np.inf)
 #: Focal lengths of phones to telephoto lenses, over the longer side of the image, in steps of a fifth.
 UNKNOWN_LENS = tuple(0.5 * 1.2**step for step in range(10))
 
@@ -283,10 +285,12 @@ def _judged(
         verdict = doubted_if_missing(verdict, here.shown.parts, here.shown.missing)
     if of_map.mirror is not None and verdict.status == "localized" and (other := mirrored()) is not None:
         verdict = doubted_if_mirrored(verdict, *of_map.mirror.closest(best, used, *other))
-    # By what was matched without the pose, too: what was looked for near a wrong one may be what agrees with its lens.
-    for fit, of in [(best, used)] + [(here.own, matches)] * (used is not matches):
-        if not options.refine_lens and verdict.status == "localized":
-            verdict = doubted_if_other_lens(verdict, lens_step(fit, of, _errors(of, options), of_map.common))
+    # What was looked for near a wrong pose may be what agrees with its lens; what was matched without it is asked, too.
+    asked = ((best, used, VERDICT), (here.own, matches, _FOCAL_LENGTH))[: 1 + (used is not matches)]
+    for fit, of, gates in asked if not options.refine_lens else ():
+        if verdict.status == "localized":
+            step = lens_step(fit, of, _errors(of, options), of_map.common, gates)
+            verdict = doubted_if_other_lens(verdict, step)
     failed = verdict.status == "failed"
     return AbsolutePose(
         verdict.status,

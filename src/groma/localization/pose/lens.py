@@ -6,7 +6,8 @@ deviation then is that of another camera. Where a piece of a photograph is moved
 put together of pieces, a pose turned by as much fits about as well, and its principal point is where the piece came
 from. What agrees with that pose was chosen by it, so that one step from there says little: the lens is fitted to all
 that is near, as a pose is, until that stays the same. Where one step of all that is near is far too small for any
-doubt, it is the answer.
+doubt, it is the answer. Where things repeat, all that is near a pose with a wrong lens may agree with both; so what was
+matched without the pose is asked, too.
 """
 
 from __future__ import annotations
