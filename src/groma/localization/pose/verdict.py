@@ -267,7 +267,8 @@ def doubted_if_other_lens(verdict: Verdict, step: LensStep) -> Verdict:
             "they fit a principal point far from where it should be better: the photograph may be cropped, or put "
             "together of pieces."
         )
-    if abs(step.focal) > max(VERDICT.focal, math.sqrt(chi_square_gate(1.0 - VERDICT.right, 1)) * step.focal_sigma):
+    chance = 0.5 * (1.0 - VERDICT.right)  # derived from two estimates, either of which may doubt
+    if abs(step.focal) > max(VERDICT.focal, math.sqrt(chi_square_gate(chance, 1)) * step.focal_sigma):
         return verdict.doubted(
             f"they fit a {'longer' if step.focal > 0.0 else 'shorter'} focal length better: the calibration is not "
             "that of this photograph. Pass its own, or let it be estimated (--calibration unknown)."
