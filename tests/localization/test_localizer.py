@@ -188,17 +188,6 @@ def test_mirrored_photographs_of_the_place_are_not_localized(place, localizer):
         assert localizer.localize(np.ascontiguousarray(image[:, ::-1])).pose.status != "localized", name
 
 
-def test_two_threads_say_what_one_says(place, localizer):
-    """The mirror image is asked while the pose is fitted; a mirrored photograph asks for it, too."""
-    image = cv2.imread(str(place / "queries" / QUERIES[3]), cv2.IMREAD_GRAYSCALE)
-    for picture in (image, np.ascontiguousarray(image[:, ::-1])):
-        alone = localizer.localize(picture).pose
-        with work_with(2):
-            found = localizer.localize(picture).pose
-        assert (found.status, found.sentence) == (alone.status, alone.sentence)
-        np.testing.assert_array_equal(found.cam_from_world, alone.cam_from_world)
-
-
 def test_photographs_in_shuffled_pieces_are_not_localized(place, localizer):
     rng = np.random.default_rng(1)
     for name in QUERIES[1::2]:

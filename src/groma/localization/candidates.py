@@ -16,7 +16,7 @@ import numpy as np
 
 from groma._rows import numbered
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.execution import map_in_threads, together
+from groma.execution import together
 from groma.features.matching.wide_baseline import match_wide_baseline
 from groma.features.segments import Segments
 from groma.gates import gate
@@ -82,16 +82,13 @@ class Candidates:
 
 
 def points_alike(points: DescribedPoints, index: MapIndex, images: IntArray) -> list[IntArray]:
-    """Match points of a query with some images of a map.
+    """Match points of a query with some images of a map, one after the other.
 
     Return pairs (n, 2) for each image: points of the query, and of the image.
     """
     vectors = unit(points.descriptors)
-
-    def match(image: int) -> IntArray:
-        return match_descriptors(vectors, unit(index.descriptor[index.begin[image] : index.begin[image + 1]]))
-
-    return map_in_threads(match, images.tolist())
+    own = (index.descriptor[index.begin[image] : index.begin[image + 1]] for image in images.tolist())
+    return [match_descriptors(vectors, unit(descriptor)) for descriptor in own]
 
 
 def described_alike(index: MapIndex, images: IntArray, pairs: Sequence[IntArray]) -> Candidates:
@@ -205,7 +202,7 @@ def _nearest(owner: IntArray, far: FloatArray, count: int) -> BoolArray:
     return first[owner] == np.arange(len(far))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class MirrorImage:
     """The mirror image of a photograph in a map."""
 
@@ -219,18 +216,20 @@ class MirrorImage:
     matched: Callable[[DescribedPoints], Candidates]
     #: Images of the map whose points are looked for near a pose.
     near: int
+    _found: Candidates = field(init=False)
 
-    def matches(self, step: int) -> tuple[Matches, IntArray]:
-        """Its matches, by each so many-th point, and the points of the map that they show."""
+    def matches(self, step: int) -> Matches:
+        """Its matches, by each so many-th point."""
         points = mirrored(self.part.points.take(np.arange(0, len(self.part.points), step)), self.camera.width)
-        found = self.matched(points)
-        return found.matches(self.part.with_points(points), self.scene, self.index), found.points[:, 1]
+        self._found = self.matched(points)
+        return self._found.matches(self.part.with_points(points), self.scene, self.index)
 
-    def distances(self, other: Refined, agreeing: IntArray, reach: float) -> FloatArray:
+    def distances(self, other: Refined, reach: float) -> FloatArray:
         """Distances of the descriptors of what agrees with a pose of the mirror image, found as far as so many pixels
-        from where it says; some points of the map agree with it.
+        from where it says; the pose is one of the last matches.
         """
         whole = self.query.with_points(mirrored(self.query.points, self.camera.width))
+        agreeing = self._found.points[other.point_inliers, 1]
         near = nearest_images(self.index, np.arange(len(self.index.image)), agreeing, self.near)
         found = found_near(whole, self.scene, self.index, near, self.camera, other.pose, (reach, reach), False)
         matches = found.matches(whole, self.scene, self.index)

@@ -258,9 +258,9 @@ class Localizer:
         def seen_in_them(used: Matches) -> Candidates:
             return next(seen for made, seen in tried if made is used)
 
-        def closest(best: Refined, used: Matches, other: Refined, points: IntArray) -> tuple[int, int]:
+        def closest(best: Refined, used: Matches, other: Refined) -> tuple[int, int]:
             distance = seen_in_them(used).distance[best.point_inliers]
-            return closest_of(distance, mirror.distances(other, points, self._reach(query, best)))
+            return closest_of(distance, mirror.distances(other, self._reach(query, best)))
 
         def expected(best: Refined, used: Matches) -> Shown:
             agreeing = seen_in_them(used).points[best.point_inliers, 1]

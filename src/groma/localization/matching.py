@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from groma._numba import loop
 from groma._typing import FloatArray, IntArray
-from groma.execution import map_ranges, num_threads
+from groma.execution import map_ranges
 from groma.gates import gate
 
 
@@ -23,8 +23,9 @@ class MatchGates:
 
 
 MATCHES = MatchGates()
-#: Rows and columns that are compared at a time (cost: half of the coarsest points of a query).
-_ROWS, _COLUMNS = 300, 512
+#: Rows that one thread compares, and rows and columns that are compared at a time (cost: the result does not depend on
+#: them).
+_OF_THREAD, _ROWS, _COLUMNS = 1024, 256, 512
 Vectors = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
 
@@ -130,8 +131,7 @@ def _nearest_two(first: Vectors, second: Vectors) -> tuple[IntArray, FloatArray,
             top[0, rows], alike[at] = alike[at], -2.0
             top[1, rows] = alike.max(axis=1)
 
-    blocks = -(-len(first) // _ROWS)
-    map_ranges(compare, len(first), max(-(-blocks // num_threads()), 1) * _ROWS)  # a thread keeps one buffer
+    map_ranges(compare, len(first), _OF_THREAD)
     return best, *_distance(top)
 
 

@@ -9,18 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, partial
 
 import numpy as np
 import numpy.typing as npt
 
-from groma._typing import BoolArray, FloatArray, IntArray
-from groma.execution import begin
+from groma._typing import BoolArray, FloatArray
 from groma.geometry import quaternion
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.free_lens import FreeLens, free_lens
 from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import max_errors, propose, straightened
+from groma.localization.pose.lens import GATES as LENS
 from groma.localization.pose.lens import lens_step
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.places import Place, weighed
@@ -30,6 +29,7 @@ from groma.localization.pose.verdict import (
     Instead,
     Shown,
     Status,
+    Verdict,
     doubted_if_mirrored,
     doubted_if_missing,
     doubted_if_other_lens,
@@ -66,7 +66,7 @@ class PoseOptions:
 #: Of so many points of a mirror image one is matched first: of the most that leave so many votes, or else of the least
 #: (cost: fewer tell too little where a place repeats).
 _SOME, _VOTES = (8, 4, 2), 12
-#: Without the principal point, which few matches, some of them wrong, do not tell (convention).
+#: Without the principal point, which few matches, some of them wrong, do not tell (chosen on the filing cabinet).
 _FOCAL_LENGTH = replace(VERDICT, shift=np.inf)
 #: Focal lengths of phones to telephoto lenses, over the longer side of the image, in steps of a fifth.
 UNKNOWN_LENS = tuple(0.5 * 1.2**step for step in range(10))
@@ -76,11 +76,10 @@ UNKNOWN_LENS = tuple(0.5 * 1.2**step for step in range(10))
 class MirrorQuestions:
     """What is asked of the mirror image of a photograph, to tell whether it was mirrored."""
 
-    #: Its matches, by each so many-th point, and the points of the map that they show.
-    matches: Callable[[int], tuple[Matches, IntArray]]
-    #: Of the most alike matches with a pose of the photograph, and with one of its mirror image, which some points of
-    #: the map agree with: how many are of each.
-    closest: Callable[[Refined, Matches, Refined, IntArray], tuple[int, int]]
+    #: Its matches, by each so many-th point.
+    matches: Callable[[int], Matches]
+    #: Of the most alike matches with a pose of the photograph, and with one of its mirror image: how many are of each.
+    closest: Callable[[Refined, Matches, Refined], tuple[int, int]]
 
 
 @dataclass(frozen=True)
@@ -241,8 +240,6 @@ def pose_from_matches(
     if best is None:
         return _failed(camera, matches)
     first = evidence_of(best, matches, places)
-    mirror = partial(_mirrored, of_map.mirror, matches, options)
-    asked = (begin if first.significant and first.agree >= enough else cache)(partial(mirror, best))
 
     def near(start: Refined) -> Place:
         assert guided is not None
@@ -257,13 +254,12 @@ def pose_from_matches(
             return Place(whole, used, own, evidence)
         return Place(whole, used, own, evidence, expected(whole, used))
 
-    found = near(best) if guided is not None and first.significant else seen(best, matches, best, first)
-    if found.evidence.agree < enough:
+    here = near(best) if guided is not None and first.significant else seen(best, matches, best, first)
+    if here.evidence.agree < enough:
         return _failed(camera, matches)
     other = _rival(matches, best, options, places, first) if options.look_for_rival and first.significant else None
-    here, there, others = weighed(found, other, near if guided else None, matches, expected is not None, of_map.telling)
-    asked = asked if here is found else partial(mirror, here.own)
-    return _judged(here, others, None if there is None else there.best.pose, matches, asked, options, of_map)
+    here, there, others = weighed(here, other, near if guided else None, matches, expected is not None, of_map.telling)
+    return _judged(here, others, None if there is None else there.best.pose, matches, options, of_map)
 
 
 def _judged(
@@ -271,7 +267,6 @@ def _judged(
     others: list[Instead],
     rival: FloatArray | None,
     matches: Matches,
-    mirrored: Callable[[], tuple[Refined, IntArray] | None],
     options: PoseOptions,
     of_map: MapQuestions,
 ) -> AbsolutePose:
@@ -283,13 +278,13 @@ def _judged(
     verdict = judge(best, covariance, median_distance(best.pose, _seen(used, best)), here.evidence, others)
     if verdict.status == "localized":
         verdict = doubted_if_missing(verdict, here.shown.parts, here.shown.missing)
-    if of_map.mirror is not None and verdict.status == "localized" and (other := mirrored()) is not None:
-        verdict = doubted_if_mirrored(verdict, *of_map.mirror.closest(best, used, *other))
+    if of_map.mirror is not None and verdict.status == "localized":
+        verdict = _unless_mirrored(verdict, here, of_map.mirror, matches, options)
     # What was looked for near a wrong pose may be what agrees with its lens; what was matched without it is asked, too.
-    asked = ((best, used, VERDICT), (here.own, matches, _FOCAL_LENGTH))[: 1 + (used is not matches)]
-    for fit, of, gates in asked if not options.refine_lens else ():
+    asked = (best, used, VERDICT, LENS.small), (here.own, matches, _FOCAL_LENGTH, LENS.small_of_others)
+    for fit, of, gates, small in asked[: 0 if options.refine_lens else 1 + (used is not matches)]:
         if verdict.status == "localized":
-            step = lens_step(fit, of, _errors(of, options), of_map.common, gates)
+            step = lens_step(fit, of, _errors(of, options), of_map.common, gates, small)
             verdict = doubted_if_other_lens(verdict, step)
     failed = verdict.status == "failed"
     return AbsolutePose(
@@ -309,27 +304,32 @@ def _judged(
     )
 
 
-def _mirrored(
-    mirror: MirrorQuestions | None, matches: Matches, options: PoseOptions, own: Refined
-) -> tuple[Refined, IntArray] | None:
-    """A pose of the mirror image of a photograph that fits about as well as its own, and the points that agree.
+def _unless_mirrored(
+    verdict: Verdict, here: Place, mirror: MirrorQuestions, matches: Matches, options: PoseOptions
+) -> Verdict:
+    """Return a verdict, or another one where the mirror image of a photograph fits about as well, and by matches that
+    are more alike.
 
     Some of its points are matched first: mostly far too few of them agree with any pose.
     """
-    if mirror is None:
-        return None
-    agree = len(np.unique(cells_of(matches.points2d, own.camera, VERDICT.cells)[own.point_inliers]))
+    points = matches.take(np.ones(matches.num_points, bool), np.zeros(matches.num_lines, bool))
+    agree = len(np.unique(cells_of(points.points2d, here.own.camera, VERDICT.cells)[here.own.point_inliers]))
     wanted = votes_of_a_rival(agree)
     parts = [(step, votes_of_a_part(wanted, 1.0 / step)) for step in _SOME]
     step, votes = next((one for one in parts if one[1] >= _VOTES), parts[-1])
-    for each, least in ((step, votes), (1, wanted)):
-        if each > 1 and not least:
-            continue
-        some, points = mirror.matches(each)
-        other = _best_of_others(own.camera, some, options, least)
-        if other is None or (evidence := evidence_of(other, some)).agree < least:
-            return None
-    return (other, points[other.point_inliers]) if evidence.significant else None
+    if votes:
+        some = mirror.matches(step)
+        other = _best_of_others(here.own.camera, some, options, votes)
+        if other is None or evidence_of(other, some).agree < votes:
+            return verdict
+    every = mirror.matches(1)
+    other = _best_of_others(here.own.camera, every, options, wanted)
+    if other is None:
+        return verdict
+    evidence = evidence_of(other, every)
+    if not evidence.significant or evidence.agree < wanted:
+        return verdict
+    return doubted_if_mirrored(verdict, *mirror.closest(here.best, here.used, other))
 
 
 def _errors(matches: Matches, options: PoseOptions) -> tuple[float, float]:

@@ -37,6 +37,10 @@ class LensGates:
         0.05, "share", "of a step that tells another lens, that one step from the pose may have without a fit",
         "derived from wrong focal lengths on cabinet, kitchen, castle: one step is 0.07 to 0.6 of the estimate",
     )  # fmt: skip
+    small_of_others: float = gate(
+        0.2, "share", "the same, by what was matched without the pose",
+        "derived from wrong focal lengths on kitchen and castle: one step is 0.4 to 1 of the estimate",
+    )  # fmt: skip
 
 
 GATES = LensGates()
@@ -62,6 +66,7 @@ def lens_step(
     max_error: tuple[float, float],
     common: Callable[[Refined, Matches, int], FloatArray] | None = None,
     gates: VerdictGates = VERDICT,
+    small: float = GATES.small,
 ) -> LensStep:
     """Estimate the focal length near a pose, and the principal point if it may be far.
 
@@ -73,11 +78,11 @@ def lens_step(
         Of :func:`groma.localization.pose.refinement.refine`.
     common
         What errors of the map add to the joint covariance of a fit to each so many-th match; None: nothing.
-    gates
-        What far means.
+    gates, small
+        What far means, and the share of it that one step from the pose may have without a fit.
     """
     focal, shift = _one_step(refined, matches)
-    if abs(focal) <= GATES.small * gates.focal and shift <= GATES.small * gates.shift:
+    if abs(focal) <= small * gates.focal and shift <= small * gates.shift:
         return LensStep(focal, np.inf)
     each = -(-(matches.num_points + matches.num_lines) // GATES.matches)
     some = matches.take(np.arange(0, matches.num_points, each), np.arange(0, matches.num_lines, each))
