@@ -16,7 +16,7 @@ from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.free_lens import free_lens
 from groma.localization.pose.gates import REFINEMENT, VERDICT
 from groma.localization.pose.hypotheses import max_errors
-from groma.localization.pose.lens import lens_step
+from groma.localization.pose.lens import LensStep, lens_step
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pose_fit import fit_pose
 from groma.localization.pose.pose_problem import problem_of
@@ -162,6 +162,13 @@ def test_what_was_matched_without_a_pose_tells_its_lens():
         found = pose_from_matches(camera, matches, of_map=MapQuestions(guided))
         assert found.status == status
         assert ("shorter focal length" in found.sentence) == (status == "uncertain")
+
+
+def test_few_matches_found_without_a_pose_tell_no_lens():
+    step, right = LensStep(-0.04, 0.008), Verdict("localized", 1.0, "")
+    assert doubted_if_other_lens(right, step, gathered=True).status == "uncertain"
+    assert doubted_if_other_lens(right, step, gathered=False) is right
+    assert doubted_if_other_lens(right, LensStep(-0.04, 0.002), gathered=False).status == "uncertain"
 
 
 def test_a_piece_that_was_moved_is_told_from_its_lens():

@@ -19,7 +19,6 @@ from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.free_lens import FreeLens, free_lens
 from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import max_errors, propose, straightened
-from groma.localization.pose.lens import GATES as LENS
 from groma.localization.pose.lens import lens_step
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.places import Place, weighed
@@ -66,8 +65,6 @@ class PoseOptions:
 #: Of so many points of a mirror image one is matched first: of the most that leave so many votes, or else of the least
 #: (cost: fewer tell too little where a place repeats).
 _SOME, _VOTES = (8, 4, 2), 12
-#: Without the principal point, which few matches, some of them wrong, do not tell (chosen on the filing cabinet).
-_FOCAL_LENGTH = replace(VERDICT, shift=np.inf)
 #: Focal lengths of phones to telephoto lenses, over the longer side of the image, in steps of a fifth.
 UNKNOWN_LENS = tuple(0.5 * 1.2**step for step in range(10))
 
@@ -281,11 +278,10 @@ def _judged(
     if of_map.mirror is not None and verdict.status == "localized":
         verdict = _unless_mirrored(verdict, here, of_map.mirror, matches, options)
     # What was looked for near a wrong pose may be what agrees with its lens; what was matched without it is asked, too.
-    asked = (best, used, VERDICT, LENS.small), (here.own, matches, _FOCAL_LENGTH, LENS.small_of_others)
-    for fit, of, gates, small in asked[: 0 if options.refine_lens else 1 + (used is not matches)]:
+    for fit, of in ((best, used), (here.own, matches))[: 0 if options.refine_lens else 1 + (used is not matches)]:
         if verdict.status == "localized":
-            step = lens_step(fit, of, _errors(of, options), of_map.common, gates, small)
-            verdict = doubted_if_other_lens(verdict, step)
+            step = lens_step(fit, of, _errors(of, options), of_map.common, gathered=of is used)
+            verdict = doubted_if_other_lens(verdict, step, of is used)
     failed = verdict.status == "failed"
     return AbsolutePose(
         verdict.status,

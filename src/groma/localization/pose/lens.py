@@ -66,23 +66,27 @@ def lens_step(
     max_error: tuple[float, float],
     common: Callable[[Refined, Matches, int], FloatArray] | None = None,
     gates: VerdictGates = VERDICT,
-    small: float = GATES.small,
+    gathered: bool = True,
 ) -> LensStep:
     """Estimate the focal length near a pose, and the principal point if it may be far.
 
     Parameters
     ----------
     refined, matches
-        A pose with the lens that was given, and what was looked for near it.
+        A pose with the lens that was given, and matches.
     max_error
         Of :func:`groma.localization.pose.refinement.refine`.
     common
         What errors of the map add to the joint covariance of a fit to each so many-th match; None: nothing.
-    gates, small
-        What far means, and the share of it that one step from the pose may have without a fit.
+    gates
+        What far means.
+    gathered
+        The matches were looked for near the pose. Else they were found without it, mostly few and some of them wrong:
+        they are not asked for the principal point.
     """
     focal, shift = _one_step(refined, matches)
-    if abs(focal) <= small * gates.focal and shift <= small * gates.shift:
+    small = GATES.small if gathered else GATES.small_of_others
+    if abs(focal) <= small * gates.focal and (shift <= small * gates.shift or not gathered):
         return LensStep(focal, np.inf)
     each = -(-(matches.num_points + matches.num_lines) // GATES.matches)
     some = matches.take(np.arange(0, matches.num_points, each), np.arange(0, matches.num_lines, each))
@@ -94,14 +98,15 @@ def lens_step(
             joint = joint + common(found, matches, each)
         return joint[6:, 6:]
 
-    found = refine(refined.camera, some, refined.pose, max_error, free_lens(refined.camera, "focal"), gathered=True)
+    found = refine(refined.camera, some, refined.pose, max_error, free_lens(refined.camera, "focal"), gathered)
     focal, sigma = float(_step(refined, found)[0]), np.inf
     if abs(focal) > gates.focal:
         sigma = float(np.sqrt(covariance(found)[0, 0]))
     points, whole = refined.camera.kind.principal_point_indices, free_lens(refined.camera, "pinhole")
-    if not points or not _may_be_far(fitted_at(found.one, found.camera, some, max_error, whole), 0.5 * gates.shift):
+    here = fitted_at(found.one, found.camera, some, max_error, whole)
+    if not gathered or not points or not _may_be_far(here, 0.5 * gates.shift):
         return LensStep(focal, sigma)
-    found = refine(refined.camera, some, refined.pose, max_error, whole, gathered=True)
+    found = refine(refined.camera, some, refined.pose, max_error, whole, gathered)
     step, uncertain = _step(refined, found), covariance(found)
     if not np.isfinite(uncertain).all():
         return LensStep(focal, sigma)
