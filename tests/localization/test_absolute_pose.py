@@ -10,11 +10,12 @@ from worlds import CAMERA, make_world, pose_of, project
 import groma
 from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion, se3, so3
-from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose
+from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose, pose_from_matches
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.refinement import _of_normal_noise, _pull, fitted, last_scale, refine
+from groma.localization.pose.verdict import most_votes
 
 #: What wrong matches may still do: the loss leaves them a small weight. A pixel is 0.007 here.
 OUTLIERS = 5e-4
@@ -185,6 +186,15 @@ def test_nothing_in_it_is_said_to_be_nothing():
         assert found.status == "failed"
         assert found.cam_from_world is None
         assert found.sentence.endswith(".")
+
+
+def test_no_pose_is_looked_for_where_fewer_cells_have_matches_than_must_agree(monkeypatch):
+    world = make_world(np.random.default_rng(22), points=40, lines=0)
+    matches = Matches(world.points2d, world.points3d)
+    cells = most_votes(matches, CAMERA)
+    assert pose_from_matches(CAMERA, matches, enough=cells).status == "localized"
+    monkeypatch.setattr("groma.localization.pose.absolute_pose.propose", None)
+    assert pose_from_matches(CAMERA, matches, enough=cells + 1).status == "failed"
 
 
 def test_mirrored_matches_are_not_believed():

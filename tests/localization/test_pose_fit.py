@@ -11,12 +11,12 @@ from groma.adjustment.terms.principal_points import GATES as PRINCIPAL_POINTS
 from groma.factors.losses import Cauchy, GemanMcClure
 from groma.geometry import se3
 from groma.localization.candidates import closest_of
-from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose, pose_from_matches
+from groma.localization.pose.absolute_pose import MapQuestions, PoseOptions, estimate_absolute_pose, pose_from_matches
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.free_lens import free_lens
 from groma.localization.pose.gates import REFINEMENT, VERDICT
 from groma.localization.pose.hypotheses import max_errors
-from groma.localization.pose.lens import lens_step
+from groma.localization.pose.lens import LensStep, lens_step
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pose_fit import fit_pose
 from groma.localization.pose.pose_problem import problem_of
@@ -149,6 +149,26 @@ def test_errors_of_the_map_count_in_what_is_told_of_a_lens():
     assert (told.focal, told.focal_sigma**2) == pytest.approx((plain.focal, plain.focal_sigma**2 + variance))
     right = Verdict("localized", 1.0, "")
     assert [doubted_if_other_lens(right, step).status for step in (plain, told)] == ["uncertain", "localized"]
+
+
+def test_what_was_matched_without_a_pose_tells_its_lens():
+    """Where things repeat, what is looked for near a pose with a wrong lens may all agree with both."""
+    matches = noisy(np.random.default_rng(6), 150, 0)[1]
+    for camera, status in ((CAMERA, "localized"), (scaled(1.02), "uncertain")):
+
+        def guided(best, camera=camera):
+            return replace(matches, points2d=project(camera, best.pose, matches.points3d))
+
+        found = pose_from_matches(camera, matches, of_map=MapQuestions(guided))
+        assert found.status == status
+        assert ("shorter focal length" in found.sentence) == (status == "uncertain")
+
+
+def test_few_matches_found_without_a_pose_tell_no_lens():
+    step, right = LensStep(-0.04, 0.008), Verdict("localized", 1.0, "")
+    assert doubted_if_other_lens(right, step, gathered=True).status == "uncertain"
+    assert doubted_if_other_lens(right, step, gathered=False) is right
+    assert doubted_if_other_lens(right, LensStep(-0.04, 0.002), gathered=False).status == "uncertain"
 
 
 def test_a_piece_that_was_moved_is_told_from_its_lens():

@@ -231,6 +231,8 @@ def pose_from_matches(
         What is asked of the map.
     """
     options, guided, expected = options or PoseOptions(), of_map.guided, of_map.expected
+    if most_votes(matches, camera) < enough:
+        return _failed(camera, matches)
     best = _best(camera, matches, options)
     if best is None:
         return _failed(camera, matches)
@@ -275,8 +277,11 @@ def _judged(
         verdict = doubted_if_missing(verdict, here.shown.parts, here.shown.missing)
     if of_map.mirror is not None and verdict.status == "localized":
         verdict = _unless_mirrored(verdict, here, of_map.mirror, matches, options)
-    if not options.refine_lens and verdict.status == "localized":
-        verdict = doubted_if_other_lens(verdict, lens_step(best, used, _errors(used, options), of_map.common))
+    # What was looked for near a wrong pose may be what agrees with its lens; what was matched without it is asked, too.
+    for fit, of in ((best, used), (here.own, matches))[: 0 if options.refine_lens else 1 + (used is not matches)]:
+        if verdict.status == "localized":
+            step = lens_step(fit, of, _errors(of, options), of_map.common, gathered=of is used)
+            verdict = doubted_if_other_lens(verdict, step, of is used)
     failed = verdict.status == "failed"
     return AbsolutePose(
         verdict.status,

@@ -6,7 +6,8 @@ deviation then is that of another camera. Where a piece of a photograph is moved
 put together of pieces, a pose turned by as much fits about as well, and its principal point is where the piece came
 from. What agrees with that pose was chosen by it, so that one step from there says little: the lens is fitted to all
 that is near, as a pose is, until that stays the same. Where one step of all that is near is far too small for any
-doubt, it is the answer.
+doubt, it is the answer. Where things repeat, all that is near a pose with a wrong lens may agree with both; so what was
+matched without the pose is asked, too.
 """
 
 from __future__ import annotations
@@ -36,6 +37,10 @@ class LensGates:
         0.05, "share", "of a step that tells another lens, that one step from the pose may have without a fit",
         "derived from wrong focal lengths on cabinet, kitchen, castle: one step is 0.07 to 0.6 of the estimate",
     )  # fmt: skip
+    small_of_others: float = gate(
+        0.2, "share", "the same, by what was matched without the pose",
+        "derived from wrong focal lengths on kitchen and castle: one step is 0.4 to 1 of the estimate",
+    )  # fmt: skip
 
 
 GATES = LensGates()
@@ -61,22 +66,27 @@ def lens_step(
     max_error: tuple[float, float],
     common: Callable[[Refined, Matches, int], FloatArray] | None = None,
     gates: VerdictGates = VERDICT,
+    gathered: bool = True,
 ) -> LensStep:
     """Estimate the focal length near a pose, and the principal point if it may be far.
 
     Parameters
     ----------
     refined, matches
-        A pose with the lens that was given, and what was looked for near it.
+        A pose with the lens that was given, and matches.
     max_error
         Of :func:`groma.localization.pose.refinement.refine`.
     common
         What errors of the map add to the joint covariance of a fit to each so many-th match; None: nothing.
     gates
         What far means.
+    gathered
+        The matches were looked for near the pose. Else they were found without it, mostly few and some of them wrong:
+        they are not asked for the principal point.
     """
     focal, shift = _one_step(refined, matches)
-    if abs(focal) <= GATES.small * gates.focal and shift <= GATES.small * gates.shift:
+    small = GATES.small if gathered else GATES.small_of_others
+    if abs(focal) <= small * gates.focal and (shift <= small * gates.shift or not gathered):
         return LensStep(focal, np.inf)
     each = -(-(matches.num_points + matches.num_lines) // GATES.matches)
     some = matches.take(np.arange(0, matches.num_points, each), np.arange(0, matches.num_lines, each))
@@ -88,14 +98,15 @@ def lens_step(
             joint = joint + common(found, matches, each)
         return joint[6:, 6:]
 
-    found = refine(refined.camera, some, refined.pose, max_error, free_lens(refined.camera, "focal"), gathered=True)
+    found = refine(refined.camera, some, refined.pose, max_error, free_lens(refined.camera, "focal"), gathered)
     focal, sigma = float(_step(refined, found)[0]), np.inf
     if abs(focal) > gates.focal:
         sigma = float(np.sqrt(covariance(found)[0, 0]))
     points, whole = refined.camera.kind.principal_point_indices, free_lens(refined.camera, "pinhole")
-    if not points or not _may_be_far(fitted_at(found.one, found.camera, some, max_error, whole), 0.5 * gates.shift):
+    here = fitted_at(found.one, found.camera, some, max_error, whole)
+    if not gathered or not points or not _may_be_far(here, 0.5 * gates.shift):
         return LensStep(focal, sigma)
-    found = refine(refined.camera, some, refined.pose, max_error, whole, gathered=True)
+    found = refine(refined.camera, some, refined.pose, max_error, whole, gathered)
     step, uncertain = _step(refined, found), covariance(found)
     if not np.isfinite(uncertain).all():
         return LensStep(focal, sigma)

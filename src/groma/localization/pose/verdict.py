@@ -256,9 +256,12 @@ def doubted_if_missing(verdict: Verdict, shown: float, missing: float) -> Verdic
     )
 
 
-def doubted_if_other_lens(verdict: Verdict, step: LensStep) -> Verdict:
+def doubted_if_other_lens(verdict: Verdict, step: LensStep, gathered: bool = True) -> Verdict:
     """Return a verdict, or ``uncertain`` where what agrees asks for a principal point far from the one that was given,
     or for another focal length: a step that is large, also beside its standard deviation.
+
+    What was matched without the pose (not ``gathered``) must tell so small a difference as is allowed: on a wall seen
+    from the front, what is like it elsewhere moves a focal length by more than is stated.
     """
     from scipy.special import chdtrc
 
@@ -267,7 +270,8 @@ def doubted_if_other_lens(verdict: Verdict, step: LensStep) -> Verdict:
             "they fit a principal point far from where it should be better: the photograph may be cropped, or put "
             "together of pieces."
         )
-    if abs(step.focal) > max(VERDICT.focal, math.sqrt(chi_square_gate(1.0 - VERDICT.right, 1)) * step.focal_sigma):
+    noise = math.sqrt(chi_square_gate(1.0 - VERDICT.right, 1)) * step.focal_sigma
+    if abs(step.focal) > max(VERDICT.focal, noise) and (gathered or noise <= VERDICT.focal):
         return verdict.doubted(
             f"they fit a {'longer' if step.focal > 0.0 else 'shorter'} focal length better: the calibration is not "
             "that of this photograph. Pass its own, or let it be estimated (--calibration unknown)."
