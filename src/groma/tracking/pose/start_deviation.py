@@ -98,7 +98,7 @@ def _reduced(
             W[:, own] += np.einsum("n,nij,nik->njk", curvature, J_pose, J_point)
             H[:, own, own] += np.einsum("n,nij,nik->njk", curvature, J_pose, J_pose)
             g[:, own] += np.einsum("n,nij,ni->nj", weight, J_pose, residual)
-    inverse = np.linalg.inv(V)
+    inverse: FloatArray = np.linalg.inv(V).astype(np.float64)
     back = W @ inverse
     S, pull = H - back @ np.swapaxes(W, 1, 2), g - np.einsum("nij,nj->ni", back, g_point)
     return inverse[:, 2, 2], -back[:, :, 2], S, pull
