@@ -178,7 +178,7 @@ def test_planes_merge_when_they_lie_on_each_other():
     table = PlaneTable()
     table.extend(3)
     table.hesse[:] = [[0, 0, 1, -2.0], [0, 0.01, 0.99995, -2.01], [0, 0, 1, -2.3]]
-    table.state[:], table.support[:] = ALIVE, [100, 50, 70]
+    table.state[:], table.found[:], table.support[:] = ALIVE, 1, [100, 50, 70]
     places = np.array([[x, y, 2.0] for x in (0, 0.2) for y in (0, 0.2)])
     table.samples[:, :4] = places
     table.samples[2, :4, 2] = 2.3

@@ -14,7 +14,7 @@ from groma.scene import Lines, PosePriors
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 from groma.tracking.frame.camera import TrackCamera, into, planes_into
-from groma.tracking.frame.measurements import DEPTH_BASELINE, LineMeasurements, PlaneMeasurements, PointMeasurements
+from groma.tracking.frame.measurements import LineMeasurements, PlaneMeasurements, PointMeasurements
 from groma.tracking.map.landmarks import ALIVE, LineTable, PlaneTable, PointTable
 from groma.tracking.map.map_scene import TRACKING, Seen, map_scene
 from groma.tracking.map.track_map import TrackMap
@@ -65,10 +65,10 @@ def _both(rng):
     K = CAMERA.params
     seen = seen_map(
         K,
-        (CAMERA.baseline, DEPTH_BASELINE),
+        (CAMERA.baseline, CAMERA.line_baseline),
         point_rows(view.points.xyz, points.pixel, points.sigma, points.right[:, 0], points.depth, points.depth_sigma),
         line_rows(view.lines.plucker, lines.ends, lines.sigma, lines.inverse_depth, lines.inverse_depth_sigma, K,
-                  DEPTH_BASELINE),
+                  CAMERA.line_baseline),
         plane_rows(view.planes.hesse, planes.plane, planes.sqrt_information),
         PRIOR,
         SIGMA,
@@ -163,5 +163,5 @@ def test_a_point_behind_the_camera_has_no_share():
 
 def test_nothing_seen_stays_where_it_was_expected():
     nothing = np.zeros((0, 9)), np.zeros((0, 18)), np.zeros((0, 17))
-    seen = seen_map(CAMERA.params, (0.0, DEPTH_BASELINE), *nothing, PRIOR, SIGMA)
+    seen = seen_map(CAMERA.params, (0.0, CAMERA.line_baseline), *nothing, PRIOR, SIGMA)
     np.testing.assert_allclose(fit_pose(seen, START, Cauchy(1.5)), PRIOR, atol=1e-6)

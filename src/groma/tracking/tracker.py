@@ -210,7 +210,7 @@ class Tracker:
     def _follow(self, data: FrameFeatures, watch: Stopwatch) -> Attempt:
         """Predict the pose and track the features of the previous frame, unless it was lost for long."""
         present = self._present
-        predicted, prior_sigma = self._motion.predict(present.pose, data.frame.timestamp)
+        predicted, prior_sigma = self._motion.predict(present.pose, data.frame.timestamp, self.map.near.depth)
         if self._lost_for > self._gates.lost_frames:
             return Attempt(predicted, prior_sigma)
         assert present.data is not None

@@ -93,6 +93,14 @@ class TrackCamera:
         )  # fmt: skip
 
     @property
+    def line_baseline(self) -> float:
+        """Baseline at which the inverse depths of segments are compared, scene units: that of the pair.
+
+        Without one it is derived from a Kinect, whose noise of 0.003 is then a pixel.
+        """
+        return self.baseline or 0.6
+
+    @property
     def params(self) -> FloatArray:
         """(4,) fx, fy, cx, cy."""
         return np.array([self.fx, self.fy, self.cx, self.cy])

@@ -305,7 +305,8 @@ class FrameFeatures:
             with np.errstate(divide="ignore"):
                 depth = np.where(self.disparities > 0, np.float32(scale) / self.disparities, np.float32(0.0))
             quadratic = 2.0 * gates.stereo.disparity_sigma / scale
-            noise = replace(segment_noise(gates.depth), constant=0.0, quadratic=quadratic, max_depth=1e4)
+            farthest = scale / gates.stereo.disparity_sigma
+            noise = replace(segment_noise(gates.depth), constant=0.0, quadratic=quadratic, max_depth=farthest)
             return segment_inverse_depths(depth, ends, self.camera.params, noise, gates.depth)
         unknown = np.full((len(ends), 2), np.nan)
         return unknown, unknown.copy()

@@ -14,10 +14,6 @@ import numpy as np
 from groma._rows import Rows, column
 from groma._typing import FloatArray, IntArray
 
-#: Baseline at which the inverse depths of segments are compared, scene units (derived from a Kinect: noise of 0.003
-#: is then a pixel).
-DEPTH_BASELINE = 0.6
-
 
 @dataclass(frozen=True, eq=False)
 class PointMeasurements(Rows):

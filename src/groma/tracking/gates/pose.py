@@ -13,9 +13,9 @@ class MotionGates:
     """Constant velocity and its noise."""
 
     max_steps: float = gate(3.0, "frames", "a motion is extrapolated over at most so many steps", SEQUENCES)
-    shift_floor: float = gate(0.02, "scene units", "smallest standard deviation of a predicted position", SEQUENCES)
+    shift_floor: float = gate(0.01, "share", "smallest deviation of a position, of the depth", "derived from the turn")
     turn_floor: float = gate(0.01, "rad", "smallest standard deviation of a predicted rotation", SEQUENCES)
-    start: float = gate(0.15, "scene units, rad", "error of predictions before any was seen", SEQUENCES)
+    start: float = gate(0.15, "share, rad", "error of predictions before any was seen", SEQUENCES)
     safety: float = gate(3.0, "ratio", "standard deviation in terms of the errors of recent predictions", SEQUENCES)
     velocity_share: float = gate(0.5, "share", "share of the predicted motion that is added to it", SEQUENCES)
     learnt: float = gate(0.2, "share", "weight of the last error against earlier ones", SEQUENCES)
@@ -31,7 +31,7 @@ class StartGates:
     most_gone: float = gate(0.5, "share", "of the points gone, with which no shift is waited for", "convention: half")
     min_points: int = gate(60, "points", "points followed and placed", "chosen on rendered rooms")
     min_inliers: float = gate(0.6, "share", "share of the points in front of both cameras", "chosen on rendered rooms")
-    depth_sigma: float = gate(0.15, "share", "median deviation of the first depths", "convention: depths are known")
+    depth_sigma: float = gate(0.15, "share", "deviation of the first depths and step", "convention: they are known")
     max_error: float = gate(1.0, "px", "distance from an epipolar line", "convention: one pixel")
     max_depth: float = gate(50.0, "median depths", "points beyond tell no position", "derived from their share: 1e-3")
     least_cost: float = gate(1e-4, "nats", "cost of a point that fits exactly", "convention: a hundredth of sigma")

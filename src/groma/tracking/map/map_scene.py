@@ -27,13 +27,7 @@ from groma.scene import (
 )
 from groma.scene.table import Table
 from groma.tracking.frame.camera import PINHOLE, TrackCamera
-from groma.tracking.frame.measurements import (
-    DEPTH_BASELINE,
-    LineMeasurements,
-    Measurements,
-    PlaneMeasurements,
-    PointMeasurements,
-)
+from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
 from groma.tracking.map.track_map import Keyframe, TrackMap
 
 #: How tracking assembles problems. Points are near and well known, and keep to plain steps.
@@ -113,7 +107,7 @@ def map_scene(
         lines=Lines(lines.ids + 1, track_map.lines.plucker[lines.ids], track_map.lines.segment[lines.ids]),
         planes=Planes(planes.ids + 1, track_map.planes.hesse[planes.ids]),
         **_point_tables(camera, points.table, points.image),
-        **_line_tables(lines.table, lines.image),
+        **_line_tables(camera, lines.table, lines.image),
         plane_observations=PlaneObservations(
             planes.image, planes.table.index, planes.table.plane, planes.table.sqrt_information
         ),
@@ -135,12 +129,12 @@ def _point_tables(camera: TrackCamera, table: PointMeasurements, image: IntArray
     return tables
 
 
-def _line_tables(table: LineMeasurements, image: IntArray) -> dict[str, object]:
+def _line_tables(camera: TrackCamera, table: LineMeasurements, image: IntArray) -> dict[str, object]:
     if not len(table):
         return {}
     tables: dict[str, object] = {"line_observations": LineObservations(image, table.index, table.ends, table.sigma)}
     rows = np.flatnonzero(np.isfinite(table.inverse_depth).all(axis=1))
     if len(rows):
-        baseline = np.full(len(rows), DEPTH_BASELINE)
+        baseline = np.full(len(rows), camera.line_baseline)
         tables["line_depths"] = LineDepths(rows, table.inverse_depth[rows], table.inverse_depth_sigma[rows], baseline)
     return tables

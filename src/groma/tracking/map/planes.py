@@ -100,8 +100,8 @@ def grow(planes: PlaneTable, index: int, places: FloatArray, support: float, gat
 
 
 def merge_planes(planes: PlaneTable, gates: PlaneGates = DEFAULT.planes) -> list[tuple[int, int]]:
-    """Merge planes of the map that have come to lie on each other; return (kept, dropped) pairs."""
-    alive = np.flatnonzero(planes.alive)
+    """Merge planes of depth images that have come to lie on each other; return (kept, dropped) pairs."""
+    alive = np.flatnonzero(planes.alive & ~planes.of_landmarks)
     merged: list[tuple[int, int]] = []
     for a, first in enumerate(alive):
         for second in alive[a + 1 :]:

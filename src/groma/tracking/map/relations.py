@@ -16,7 +16,7 @@ from groma._typing import IntArray
 from groma.scene import Relations
 from groma.tracking.map.track_map import TrackMap
 
-#: Distance of a line's ends from its plane: gate, and standard deviation, scene units.
+#: Distance of a line's ends from its plane: gate, and standard deviation, scene units (of depth cameras: metres).
 ON_PLANE, ON_PLANE_SIGMA = 0.03, 0.01
 #: The plane was seen within this distance of the line, scene units.
 NEAR = 0.25
@@ -25,10 +25,11 @@ SQUARE, SQUARE_SIGMA = math.radians(4.0), math.radians(0.7)
 
 
 def find_lines_on_planes(track_map: TrackMap) -> None:
-    """Note for each line the plane it lies on, or -1."""
+    """Note for each line the plane of depth images that it lies on, or -1; those on planes of landmarks stay there."""
     lines, planes = track_map.lines, track_map.planes
-    lines.plane[:] = -1
-    rows, alive = np.flatnonzero(lines.alive), np.flatnonzero(planes.alive)
+    loose = ~np.isin(lines.plane, np.flatnonzero(planes.of_landmarks))
+    lines.plane[loose] = -1
+    rows, alive = np.flatnonzero(lines.alive & loose), np.flatnonzero(planes.alive & ~planes.of_landmarks)
     if not len(rows) or not len(alive):
         return
     ends = lines.segment[rows]

@@ -28,7 +28,7 @@ from groma.adjustment.pose_fit import (
 from groma.factors.losses import Cauchy, GemanMcClure, Loss
 from groma.gates import NORMAL
 from groma.tracking.frame.camera import TrackCamera, into
-from groma.tracking.frame.measurements import DEPTH_BASELINE, Measurements
+from groma.tracking.frame.measurements import Measurements
 from groma.tracking.map.track_map import TrackMap
 
 #: A residual beyond this many standard deviations is an outlier.
@@ -116,9 +116,9 @@ def _seen(
     segments = lines.ends, lines.sigma, lines.inverse_depth, lines.inverse_depth_sigma
     return seen_map(
         K,
-        (camera.baseline, DEPTH_BASELINE),
+        (camera.baseline, camera.line_baseline),
         point_rows(place, points.pixel, points.sigma, points.right[:, 0], points.depth, points.depth_sigma),
-        line_rows(view.lines.plucker[lines.index], *segments, K, DEPTH_BASELINE),
+        line_rows(view.lines.plucker[lines.index], *segments, K, camera.line_baseline),
         plane_rows(view.planes.hesse[planes.index], planes.plane, planes.sqrt_information),
         predicted,
         prior_sigma,

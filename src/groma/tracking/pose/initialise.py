@@ -8,7 +8,6 @@ motion is left, explains most points, and their depths are known; if none explai
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -25,6 +24,7 @@ from groma.tracking.map.points import PointTracks
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.map.triangulation import triangulate
 from groma.tracking.options import TrackOptions
+from groma.tracking.pose.start_deviation import start_deviation
 from groma.tracking.pose.two_views import IDENTITY, Candidate, likely, proposed, proposed_by_ends, with_third
 
 
@@ -103,10 +103,11 @@ class Initialiser:
         return np.stack([IDENTITY, self._pose])
 
     def _is_known(self, left: list[Candidate]) -> bool:
-        """Whether one motion is left, and parallax tells the depths of its points."""
-        sigma, best = self._options.point_sigma_px, left[0]
-        known = math.sqrt(2.0) * sigma / (self._camera.fx * self._gates.depth_sigma)
-        return len(left) == 1 and bool(np.median(best.parallax()[best.agrees]) >= known)
+        """Whether one motion is left, and known well, and the depths of its points with it."""
+        best, sigma = left[0], self._options.point_sigma_px
+        if len(left) > 1 or best.agrees.sum() < self._gates.min_points:
+            return False
+        return start_deviation(self._camera, best, np.stack(self._views), sigma) <= self._gates.depth_sigma
 
     def make_map(self, track_map: TrackMap) -> tuple[Followed, FloatArray]:
         """Fill an empty map; return what is followed from now on, and the pose of the newest frame."""

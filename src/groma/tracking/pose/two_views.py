@@ -44,7 +44,8 @@ from groma.tracking.frame.rectification import cells_of
 from groma.tracking.gates import StartGates
 from groma.tracking.map.map_scene import TRACKING
 
-_ASSEMBLY = replace(TRACKING, gauge="first_camera", loss=Cauchy(1.5))
+LOSS = Cauchy(1.5)
+_ASSEMBLY = replace(TRACKING, gauge="first_camera", loss=LOSS)
 _SOLVER = SolverOptions(max_iterations=50, function_tolerance=1e-5, threads=1)
 IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])
 
@@ -63,13 +64,6 @@ class Candidate:
     agrees: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
     #: How many points with independent errors would tell as much.
     witnesses: float = 0.0
-
-    def parallax(self) -> FloatArray:
-        """(N,) angle between the rays of the first and of the last view, radians."""
-        center = se3.inverse(self.poses[-1:])[0, 4:]
-        one, two = self.places, self.places - center
-        cosine = (one * two).sum(axis=1) / (np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1))
-        return np.arccos(np.clip(cosine, -1.0, 1.0))
 
 
 def motions(camera: TrackCamera, one: FloatArray, two: FloatArray, gates: StartGates) -> list[FloatArray]:
