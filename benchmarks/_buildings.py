@@ -4,13 +4,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from _rendered_boxes import BOX_SIDES, BoxSettings, RenderedScene, World, render
 
 from groma.geometry import se3
+from groma.geometry.algebra import unit
 
 X, Y, Z = np.eye(3)
+#: Lengths and sines that are none.
+NOTHING = 1e-6
 SHADES = [50.0, 80.0, 150.0, 180.0, 210.0, 240.0]
 
 
@@ -90,9 +94,32 @@ def render_building(settings: BuildingSettings) -> RenderedScene:
     site = _Site(rng, World([], [], np.zeros((0, 2, 3)), [], []))
     poses, focal = KINDS[settings.kind](site)
     faces = site.world.polygons
-    world = replace(site.world, edges=np.concatenate([np.stack([p, np.roll(p, -1, axis=0)], axis=1) for p in faces]))
+    edges = [np.stack([face, np.roll(face, -1, axis=0)], axis=1) for face in faces]
+    world = replace(site.world, edges=np.concatenate([*edges, _crossings(faces)]))
     images = BoxSettings(width=640, height=480, focal=focal, num_images=len(poses), texture=settings.texture)
     return render(world, np.array(poses), images, rng)
+
+
+def _crossings(faces: list[np.ndarray]) -> np.ndarray:
+    """(K, 2, 3) where faces pass through each other, as steps through windows: edges that are no side of a face."""
+    corner = np.array([face[:3] for face in faces])
+    normals = unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
+    found = []
+    for i, j in combinations(range(len(faces)), 2):
+        along = np.cross(normals[i], normals[j])
+        if np.linalg.norm(along) < NOTHING:
+            continue
+        planes = np.array([normals[i], normals[j], along])
+        start = np.linalg.solve(planes, [normals[i] @ faces[i][0], normals[j] @ faces[j][0], along @ faces[i][0]])
+        inward = np.concatenate([unit(np.cross(normals[k], np.roll(faces[k], -1, axis=0) - faces[k])) for k in (i, j)])
+        # Inside is where room + t slope is positive for all sides of both.
+        room, slope = ((start - np.concatenate([faces[i], faces[j]])) * inward).sum(1) - NOTHING, inward @ along
+        even = np.abs(slope) < NOTHING
+        at = -room / np.where(even, 1.0, slope)
+        low, high = at[~even & (slope > 0.0)].max(), at[~even & (slope < 0.0)].min()
+        if low < high and (room[even] > 0.0).all():
+            found.append([start + low * along, start + high * along])
+    return np.array(found).reshape(-1, 2, 3)
 
 
 def _room(site: _Site) -> tuple[list, float]:
