@@ -56,8 +56,8 @@ from groma.scene import Scene
 
 #: The quantities, and the weight of each as ``benchmarks/line_confidence.py`` found it.
 WEIGHTS: dict[str, float] = {
-    "constant": 2.97, "spread": 1.12, "support": 1.47, "beside": 1.15, "residual": -0.93, "drift": -1.49,
-    "texture": -5.34, "prominence": 3.01,
+    "constant": 2.973, "spread": 1.118, "support": 1.476, "beside": 1.151, "residual": -0.927, "drift": -1.494,
+    "texture": -5.345, "prominence": 3.012,
 }  # fmt: skip
 
 
