@@ -99,9 +99,8 @@ def render_building(settings: BuildingSettings) -> RenderedScene:
     faces = site.world.polygons
     edges = [np.stack([face, np.roll(face, -1, axis=0)], axis=1) for face in faces]
     world = replace(site.world, edges=np.concatenate([*edges, _crossings(faces)]))
-    looks = {"texture": settings.texture, "noise": settings.noise, "blur": settings.blur}
-    images = BoxSettings(width=640, height=480, focal=focal, num_images=len(poses), **looks)
-    return render(world, np.array(poses), images, rng)
+    images = BoxSettings(width=640, height=480, focal=focal, num_images=len(poses), texture=settings.texture)
+    return render(world, np.array(poses), replace(images, noise=settings.noise, blur=settings.blur), rng)
 
 
 def _crossings(faces: list[np.ndarray]) -> np.ndarray:

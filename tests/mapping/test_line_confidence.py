@@ -194,7 +194,7 @@ def test_the_lines_of_a_scene_tell_the_share_that_has_an_edge():
 def test_the_lines_of_a_scene_tell_the_share_that_is_texture():
     weights = np.array(list(WEIGHTS.values()))
 
-    def probability(*likelihood, together=50.0):
+    def probability(*likelihood, together=(50.0,)):
         rows = np.zeros((len(likelihood), len(WEIGHTS)))
         rows[:, TOGETHER.start] = np.array(together) / weights[TOGETHER.start]
         rows[:, -1] = np.array(likelihood) / weights[NO_TEXTURE][-1]
@@ -206,7 +206,7 @@ def test_the_lines_of_a_scene_tell_the_share_that_is_texture():
     share = (0.5 * GATES.prior_lines + found.sum()) / (GATES.prior_lines + len(found))
     np.testing.assert_allclose(found[0], expit(0.5 + logit(share)), rtol=1e-9)
     # Lines whose segments do not belong together tell nothing of texture.
-    unrelated = probability(0.5, *[-9.0] * 100, together=[50.0, *[-50.0] * 100])
+    unrelated = probability(0.5, *[-9.0] * 100, together=(50.0, *[-50.0] * 100))
     assert unrelated[0] == pytest.approx(alone, abs=1e-9)
 
 
