@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Rendered rooms and houses whose faces are known exactly: a furnished room, oblique wings, a gabled house, stairs."""
+"""Buildings whose faces are known exactly: a furnished room, oblique wings, a gabled house, stairs, towers."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from _rendered_boxes import BOX_SIDES, BoxSettings, RenderedScene, World, render
 
 from groma.geometry import se3
+from groma.geometry.algebra import unit
 
 X, Y, Z = np.eye(3)
+#: Lengths and sines that are none.
+NOTHING = 1e-6
 SHADES = [50.0, 80.0, 150.0, 180.0, 210.0, 240.0]
 
 
@@ -20,7 +24,10 @@ class BuildingSettings:
 
     kind: str
     seed: int
+    #: As of boxes.
     texture: float = 10.0
+    noise: float = 2.0
+    blur: float = 0.6
 
 
 @dataclass
@@ -90,9 +97,32 @@ def render_building(settings: BuildingSettings) -> RenderedScene:
     site = _Site(rng, World([], [], np.zeros((0, 2, 3)), [], []))
     poses, focal = KINDS[settings.kind](site)
     faces = site.world.polygons
-    world = replace(site.world, edges=np.concatenate([np.stack([p, np.roll(p, -1, axis=0)], axis=1) for p in faces]))
+    edges = [np.stack([face, np.roll(face, -1, axis=0)], axis=1) for face in faces]
+    world = replace(site.world, edges=np.concatenate([*edges, _crossings(faces)]))
     images = BoxSettings(width=640, height=480, focal=focal, num_images=len(poses), texture=settings.texture)
-    return render(world, np.array(poses), images, rng)
+    return render(world, np.array(poses), replace(images, noise=settings.noise, blur=settings.blur), rng)
+
+
+def _crossings(faces: list[np.ndarray]) -> np.ndarray:
+    """(K, 2, 3) where faces pass through each other, as steps through windows: edges that are no side of a face."""
+    corner = np.array([face[:3] for face in faces])
+    normals = unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
+    found = []
+    for i, j in combinations(range(len(faces)), 2):
+        along = np.cross(normals[i], normals[j])
+        if np.linalg.norm(along) < NOTHING:
+            continue
+        planes = np.array([normals[i], normals[j], along])
+        start = np.linalg.solve(planes, [normals[i] @ faces[i][0], normals[j] @ faces[j][0], along @ faces[i][0]])
+        inward = np.concatenate([unit(np.cross(normals[k], np.roll(faces[k], -1, axis=0) - faces[k])) for k in (i, j)])
+        # Inside is where room + t slope is positive for all sides of both.
+        room, slope = ((start - np.concatenate([faces[i], faces[j]])) * inward).sum(1) - NOTHING, inward @ along
+        even = np.abs(slope) < NOTHING
+        at = -room / np.where(even, 1.0, slope)
+        low, high = at[~even & (slope > 0.0)].max(), at[~even & (slope < 0.0)].min()
+        if low < high and (room[even] > 0.0).all():
+            found.append([start + low * along, start + high * along])
+    return np.array(found).reshape(-1, 2, 3)
 
 
 def _room(site: _Site) -> tuple[list, float]:
@@ -172,6 +202,31 @@ def _stairs(site: _Site) -> tuple[list, float]:
     return _arc(rng, [2.0, 4.6], [0.0, 0.5 * back[1], 0.6 * back[2] + 0.4], 14), 480.0
 
 
+def _tower(site: _Site) -> tuple[list, float]:
+    """A tower of five to eight sides with slabs that stand out, and slender posts around it, seen from a helix."""
+    rng, number = site.rng, int(site.rng.integers(5, 9))
+    floor, height = site.floor(4.0, 4.0), site.rng.uniform(2.2, 3.0)
+    turn = rng.uniform(0, np.pi) + 2 * np.pi * np.arange(number + 1) / number
+    round_ = np.column_stack([np.cos(turn), np.sin(turn), 0.0 * turn])
+    for first, last in zip(1.1 * round_[:-1], 1.1 * round_[1:], strict=True):
+        normal = (first + last) / np.linalg.norm(first + last)
+        site.wall(first, last - first, height * Z, normal, rng.choice([0.0, 0.004]))
+    for low in (0.5 * height - 0.05, height):
+        for level in (low, low + 0.1):
+            site.face((1.3 * round_[:-1] + level * Z).tolist(), rng.choice(SHADES))
+        for first, last in zip(1.3 * round_[:-1] + low * Z, 1.3 * round_[1:] + low * Z, strict=True):
+            site.face([first, last, last + 0.1 * Z, first + 0.1 * Z], rng.choice(SHADES))
+    for way in rng.uniform(0, 2 * np.pi, 5):
+        tall = rng.uniform(0.4, 0.9)
+        site.box([2.1 * np.cos(way), 2.1 * np.sin(way), tall], [0.04, 0.04, tall], rng.uniform(0, np.pi), floor)
+    poses = []
+    for share in np.arange(20) / 20:
+        way = 4 * np.pi * share
+        center = np.array([4.2 * np.cos(way), 4.2 * np.sin(way), 0.7 + 3.3 * share]) + rng.normal(0, 0.1, 3)
+        poses.append(se3.looking_at(center, np.array([0, 0, 0.5 * height]) + rng.normal(0, 0.1, 3)))
+    return poses, 520.0
+
+
 def _arc(rng: np.random.Generator, radii: list, target: list, number: int) -> list:
     """Poses on an arc before the front of a building."""
     poses = []
@@ -182,4 +237,4 @@ def _arc(rng: np.random.Generator, radii: list, target: list, number: int) -> li
 
 
 #: By name: what puts up the faces of a building, and returns poses and focal length.
-KINDS = {"room": _room, "wings": _wings, "gable": _gable, "stairs": _stairs}
+KINDS = {"room": _room, "wings": _wings, "gable": _gable, "stairs": _stairs, "tower": _tower}

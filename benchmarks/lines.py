@@ -3,8 +3,8 @@
 
     python benchmarks/lines.py [SCENE ...] [--data DIR] [--python-limap PYTHON] [--curves SVG] [--cluster-size N]
 
-A scene is one of the list, or KIND-SEED (boxes, room, wings, gable, stairs): rendered anew, and compared at 0.2, 1, 5
-and 10 thousandths of its extent.
+A scene is one of the list, or KIND-SEED (boxes, room, wings, gable, stairs, tower): rendered anew, and compared at 0.2,
+1, 5 and 10 thousandths of its extent.
 
 Without a Python that has pylimap 2 groma runs alone. Scenes whose data is not in the folder are left out.
 """

@@ -4,22 +4,25 @@ r"""How probable it is that a line is right, from what its observations say.
 A line is called right where an edge of the object runs along it, at least along half of it, within 2.5 thousandths of
 the usual distance of lines from their cameras. Four things must be true of it:
 
-.. math:: p = \frac{1}{1 + \exp(-w_0 - \sum_k w_k x_k - b)}\; \frac{1}{1 + \exp(-w_s - w_t x_t)}\;
-          \operatorname{erf}\frac{\tau}{\sqrt 2\, u}\; \operatorname{erf}\frac{1}{\sqrt 2\, r}.
+.. math:: p = \frac{1}{1 + \exp(-w_0 - \sum_k w_k x_k - b)}\; \frac{1}{1 + \exp(-w_s - w_t x_t - c)}\;
+          \bigl(2 F_4(\tau / u) - 1\bigr)\; \operatorname{erf}\frac{1}{\sqrt 2\, r}.
 
 The first factor, that its segments belong together, is a logistic model of five quantities (:func:`line_evidence`).
 The outline of a round body is no edge, and moves with the view: its segments drift from any line that stands still, and
 images that show the body beside it do not show it where others do. How many lines of a scene have an edge is not known
-beforehand: nearly all of a plain box, few of an upholstered chair. Their share :math:`\pi`, of log odds b, is estimated
-from the lines themselves, with a prior of m lines of which half have one (:func:`edge_probability`). The second, that
-they are no texture, is one of the prominence alone: contrast (:mod:`groma.features.contrast`) times relative length,
-since texture has stripes of the same contrast beside it, and its stripes are short. Where views agree on texture, as
-they do on stripes of a wall, only this factor tells. The third is the probability of a normal error within
+beforehand: nearly all of a plain box, few of an upholstered chair. Their share, of log odds b, is estimated from the
+lines themselves, with a prior of m lines of which half have one (:func:`edge_probability`). The second, that they are
+no texture, is one of the prominence alone: contrast (:mod:`groma.features.contrast`) times relative length, since
+texture has stripes of the same contrast beside it, and its stripes are short. Where views agree on texture, as they do
+on stripes of a wall, only this factor tells. Whether there is such texture, the lines tell as well: where many are
+surely stripes, doubtful ones are likely more of them. The share of lines that are none, of log odds c, is estimated
+like the other. The third is the probability of an error within
 :math:`\tau = 0.0025`, where u is the standard deviation across the line that half of its places do not exceed, over the
-usual distance. Segments and the planes that the line lies on tell it together: of an edge that all images see from one
-height, planes know the depth. The fourth is the share of normal residuals of r pixels root mean square within the width
-of an edge, a pixel: chords of curves fit no single line, and where segments of a curve are bowed their standard
-deviations, and with them r, say so.
+usual distance, and F the Student distribution of four degrees of freedom: errors have heavy tails, since what edges
+beside it displace is displaced in all images alike. Segments and the planes that the line lies on tell u together: of
+an edge that all images see from one height, planes know the depth. The fourth is the share of normal residuals of r
+pixels root mean square within the width of an edge, a pixel: chords of curves fit no single line, and where segments of
+a curve are bowed their standard deviations, and with them r, say so.
 
 No quantity depends on the unit of length or on how many pixels an image has. The weights were fitted on rendered scenes
 of boxes and round bodies whose edges are known exactly, and the probabilities compared with those of other scenes
@@ -53,8 +56,8 @@ from groma.scene import Scene
 
 #: The quantities, and the weight of each as ``benchmarks/line_confidence.py`` found it.
 WEIGHTS: dict[str, float] = {
-    "constant": 2.619, "spread": 1.194, "support": 1.656, "beside": 0.971, "residual": -1.134, "drift": -1.461,
-    "texture": -4.219, "prominence": 3.240,
+    "constant": 2.973, "spread": 1.118, "support": 1.476, "beside": 1.151, "residual": -0.927, "drift": -1.494,
+    "texture": -5.345, "prominence": 3.012,
 }  # fmt: skip
 
 
@@ -63,6 +66,9 @@ class ConfidenceGates:
     """What a line must be within to be right."""
 
     tolerance: float = gate(0.0025, "1", "error of a right line over the distance", "convention: two pixels")
+    freedom: float = gate(
+        4.0, "1", "degrees of Student's distribution of errors of lines", "chosen on the scenes of the fit"
+    )
     prior_lines: float = gate(
         30.0, "lines", "that the prior on the share of lines with an edge counts for",
         "chosen on the scenes of the fit, each left out in turn",
@@ -100,22 +106,31 @@ def line_confidence(scene: Scene, surface_px: float = SURFACE_SIGMA_PX) -> Float
 
 
 def edge_probability(evidence: FloatArray, weights: FloatArray) -> FloatArray:
-    r"""Return the probability (L,) that there is an edge, from what :func:`line_evidence` returns and its weights.
+    """Return the probability (L,) that there is an edge, from what :func:`line_evidence` returns and its weights.
 
-    The lines are all those of a scene. Weights are of log likelihood ratios z: the share of lines with an edge solves
+    The lines are all those of a scene. Weights are of log likelihood ratios; the shares of lines whose segments belong
+    together, and of those among them that are no texture, are estimated from the lines.
+    """
+    together, no_texture = (evidence[:, part] @ weights[part] for part in (TOGETHER, NO_TEXTURE))
+    belongs = _with_share(together, np.ones(len(together)))
+    return belongs * _with_share(no_texture, belongs)
 
-    .. math:: (n + m)\, \pi = \tfrac m2 + \sum_i \frac{1}{1 + \exp(-z_i - b)}, \qquad b = \log\frac{\pi}{1 - \pi},
+
+def _with_share(ratio: FloatArray, count: FloatArray) -> FloatArray:
+    r"""Probabilities of log likelihood ratios z of lines that count :math:`n_i`, with a share of right ones that solves
+
+    .. math:: \left(m + \sum_i n_i\right) \pi = \tfrac m2 + \sum_i \frac{n_i}{1 + \exp(-z_i - b)},
+              \qquad b = \log\frac{\pi}{1 - \pi},
 
     the fixed point of expectation maximisation, of which there is one.
     """
-    together, no_texture = (evidence[:, part] @ weights[part] for part in (TOGETHER, NO_TEXTURE))
     low, high, expit = -_MOST_ODDS, _MOST_ODDS, scipy.special.expit
     for _ in range(_HALVINGS):
         odds = 0.5 * (low + high)
-        expected = 0.5 * GATES.prior_lines + expit(together + odds).sum()
-        more = expected > (len(together) + GATES.prior_lines) * expit(odds)
+        expected = 0.5 * GATES.prior_lines + (count * expit(ratio + odds)).sum()
+        more = expected > (count.sum() + GATES.prior_lines) * expit(odds)
         low, high = (odds, high) if more else (low, odds)
-    return np.asarray(expit(together + low) * expit(no_texture))
+    return np.asarray(expit(ratio + low))
 
 
 def line_accuracy(
@@ -127,7 +142,7 @@ def line_accuracy(
     """
     noise = line_noise(scene) if noise is None else noise
     deviation = _deviation(scene, noise, surface_px) / usual_distance(scene)
-    within = scipy.special.erf(gates.tolerance / (math.sqrt(2.0) * deviation))
+    within = 2.0 * scipy.special.stdtr(gates.freedom, gates.tolerance / deviation) - 1.0
     return within * scipy.special.erf(gates.edge_px / (math.sqrt(2.0) * _residual_px(scene, noise)))
 
 
