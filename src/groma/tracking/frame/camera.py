@@ -94,11 +94,10 @@ class TrackCamera:
 
     @property
     def line_baseline(self) -> float:
-        """Baseline at which the inverse depths of segments are compared, scene units: that of the pair.
-
-        Without one it is derived from a Kinect, whose noise of 0.003 is then a pixel.
+        """Baseline at which the inverse depths of segments are compared, scene units: that of the pair if it is longer
+        than what is derived from a Kinect, whose noise of 0.003 is then a pixel.
         """
-        return self.baseline or 0.6
+        return max(self.baseline, 0.6)
 
     @property
     def params(self) -> FloatArray:
