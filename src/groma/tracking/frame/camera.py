@@ -97,7 +97,7 @@ class TrackCamera:
         """Baseline at which the inverse depths of segments are compared, scene units: that of the pair if it is longer
         than what is derived from a Kinect, whose noise of 0.003 is then a pixel.
         """
-        return max(self.baseline, 0.6)
+        return max(self.baseline, 0.6)  # derived from 0.003 / m of inverse depth at a focal length of 525 px
 
     @property
     def params(self) -> FloatArray:
