@@ -60,5 +60,7 @@ def test_the_picture_has_a_curve_for_each_program(lines):
 
 
 def test_scenes_are_listed_or_made_of_a_kind_and_a_seed(lines):
-    assert all(lines.UNSEEN.fullmatch(name) for name in ("stairs-3103", "boxes-1", "room-2", "wings-3", "gable-4", "tower-5"))
+    assert all(
+        lines.UNSEEN.fullmatch(name) for name in ("stairs-3103", "boxes-1", "room-2", "wings-3", "gable-4", "tower-5")
+    )
     assert not any(lines.UNSEEN.fullmatch(name) for name in (*lines.SCENES, "stairs", "spire-3", "stairs-3-4"))
