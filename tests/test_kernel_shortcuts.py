@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from llvmlite import ir
 from numba import extending
-from numba.core import compiler, event, types
+from numba.core import compiler, errors, event, ssa, types
 from numba.core.registry import cpu_target
+from numba.core.typed_passes import type_inference_stage
 
 from groma._kernels import shortcuts
 from groma._numba import loop
@@ -97,6 +98,83 @@ def test_operators_mean_what_they_mean_to_numba():
             meant = context.resolve_function_type(add, (one, other), {})
             for _ in range(2):
                 assert shortcuts._Typing(context).resolve_function_type(add, (one, other), {}) == meant
+
+
+def _grows(n):
+    total = 0
+    for i in range(n):
+        total = total + i
+        if i > 3:
+            total = total * 0.5
+    return total
+
+
+def _fills(n):
+    found = np.empty(n)
+    last = found[0]
+    for i in range(n):
+        found[i] = np.sqrt(i + last)
+        if found[i] > 1.0:
+            last = found[i]
+            continue
+        pair, number = (i, found), i
+        last = pair[1][number]
+    return found, last
+
+
+def _appended(n):
+    found = []
+    for i in range(n):
+        found.append((i, 1.5))
+    return found
+
+
+def _types(function):
+    context, target = cpu_target.typing_context, cpu_target.target_context
+    return type_inference_stage(context, target, compiler.run_frontend(function), (types.int64,), None)[:3]
+
+
+@pytest.mark.parametrize("function", (_grows, _fills, _appended))
+def test_types_are_those_of_numba_in_fewer_steps(function, monkeypatch):
+    applied = []
+    numbas = shortcuts._propagate
+    monkeypatch.setattr(shortcuts, "_propagate", lambda one, inferer: applied.append(one) or numbas(one, inferer))
+    cpu_target.typing_context.refresh()
+    kinds, returned, calls = _types(function)
+    with shortcuts.remembering():
+        found, also_returned, also_calls = _types(function)
+    assert (found, also_returned) == (kinds, returned)
+    assert list(map(str, also_calls.values())) == list(map(str, calls.values()))
+    assert len(applied) < 1.5 * len({id(one.constraints[0]) for one in applied})
+
+
+def test_a_type_that_cannot_be_is_told():
+    def mixes(n):
+        found = "text"
+        for i in range(n):
+            found = found + i
+        return found
+
+    with shortcuts.remembering(), pytest.raises(errors.TypingError, match="add"):
+        _types(mixes)
+
+
+@pytest.mark.parametrize("function", (_grows, _fills))
+def test_variables_are_renamed_as_numba_does_in_fewer_steps(function, monkeypatch):
+    steps = []
+    numbas = ssa._run_ssa_block_pass
+    monkeypatch.setattr(ssa, "_run_ssa_block_pass", lambda *given: steps.append(given) or numbas(*given))
+
+    def renamed():
+        steps.clear()
+        blocks = ssa.reconstruct_ssa(compiler.run_frontend(function)).blocks
+        return [(label, str(line)) for label, block in blocks.items() for line in block.body], len(steps)
+
+    lines, of_numba = renamed()
+    with shortcuts.remembering():
+        same, ours = renamed()
+    assert same == lines
+    assert ours < of_numba
 
 
 def test_code_is_made_for_what_operators_mean_to_numba():
