@@ -23,6 +23,7 @@ import builtins
 import math
 import operator
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -34,7 +35,7 @@ from numba.core import base, event, lowering, ssa, typeinfer, types
 from numba.core import ir as numba_ir
 from numba.core.base import BaseContext
 from numba.core.compiler_machinery import register_pass
-from numba.core.errors import new_error_context  # type: ignore[attr-defined]
+from numba.core.errors import ForceLiteralArg, NumbaWarning, TypingError, new_error_context  # type: ignore[attr-defined]
 from numba.core.runtime.context import NRTContext
 from numba.core.targetconfig import TargetConfig
 from numba.core.typed_passes import NopythonTypeInference
@@ -165,20 +166,32 @@ def _propagated(self: Any, inferer: Any) -> list[Any]:
     Numba applies all of them until no type changes, the last time to find that none does.
     """
     errors: list[Any] = []
+    told: list[tuple[Any, warnings.WarningMessage]] = []
     find = inferer.typevars.get
-    for constraint in self.constraints:
-        parts = vars(constraint)
-        if "groma_read" not in parts:
-            parts["groma_read"] = _read(constraint)
-        before = [found.type for name in parts["groma_read"] if (found := find(name)) is not None]
-        if before == parts.get("groma_seen"):
-            continue
-        one = ConstraintNetwork()
-        one.append(constraint)
-        raised = _propagate(one, inferer)
-        after = [found.type for place in _DEFINED if (found := find(parts.get(place))) is not None]
-        parts["groma_seen"] = None if raised or not all(map(_is_settled, before + after)) else before
-        errors.extend(raised)
+    with warnings.catch_warnings(record=True) as heard:  # once, not for each constraint
+        warnings.simplefilter("always", NumbaWarning)
+        for constraint in self.constraints:
+            parts = vars(constraint)
+            if "groma_read" not in parts:
+                parts["groma_read"] = _read(constraint)
+            before = [found.type for name in parts["groma_read"] if (found := find(name)) is not None]
+            if before == parts.get("groma_seen"):
+                continue
+            try:
+                constraint(inferer)
+                raised = []
+            except (ForceLiteralArg, TypingError):  # again, for Numba to say what is wrong
+                one = ConstraintNetwork()
+                one.append(constraint)
+                raised = _propagate(one, inferer)
+            told.extend((constraint.loc, one) for one in heard)
+            heard.clear()
+            after = [found.type for place in _DEFINED if (found := find(parts.get(place))) is not None]
+            parts["groma_seen"] = None if raised or not all(map(_is_settled, before + after)) else before
+            errors.extend(raised)
+    for place, one in told:
+        with inferer.warnings.catch_warnings(place.filename, place.line):
+            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
     return errors
 
 
