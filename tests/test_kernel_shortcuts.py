@@ -5,6 +5,7 @@ import itertools
 import math
 import operator
 import sys
+import warnings
 
 import llvmlite.binding as llvm
 import numba
@@ -12,8 +13,10 @@ import numpy as np
 import pytest
 from llvmlite import ir
 from numba import extending
-from numba.core import compiler, event, types
+from numba.core import compiler, errors, event, ssa, types
 from numba.core.registry import cpu_target
+from numba.core.typed_passes import type_inference_stage
+from numba.core.typeinfer import CallConstraint
 
 from groma._kernels import shortcuts
 from groma._numba import loop
@@ -97,6 +100,106 @@ def test_operators_mean_what_they_mean_to_numba():
             meant = context.resolve_function_type(add, (one, other), {})
             for _ in range(2):
                 assert shortcuts._Typing(context).resolve_function_type(add, (one, other), {}) == meant
+
+
+def _grows(n):
+    total = 0
+    for i in range(n):
+        total = total + i
+        if i > 3:
+            total = total * 0.5
+    return total
+
+
+def _fills(n):
+    found = np.empty(n)
+    last = found[0]
+    for i in range(n):
+        found[i] = np.sqrt(i + last)
+        if found[i] > 1.0:
+            last = found[i]
+            continue
+        pair, number = (i, found), i
+        last = pair[1][number]
+    return found, last
+
+
+def _appended(n):
+    found = []
+    for i in range(n):
+        found.append((i, 1.5))
+    return found
+
+
+def _warning(n):
+    return n
+
+
+@extending.overload(_warning)
+def _overload_of_warning(n):
+    warnings.warn(errors.NumbaWarning("slow"), stacklevel=1)
+    warnings.warn("another", stacklevel=1)
+    return lambda n: n
+
+
+def _types(function):
+    context, target = cpu_target.typing_context, cpu_target.target_context
+    return type_inference_stage(context, target, compiler.run_frontend(function), (types.int64,), None)[:3]
+
+
+@pytest.mark.parametrize("function", (_grows, _fills, _appended))
+def test_types_are_those_of_numba_in_fewer_steps(function, monkeypatch):
+    applied = []
+    resolve = CallConstraint.resolve
+    monkeypatch.setattr(CallConstraint, "resolve", lambda *given, **more: applied.append(1) or resolve(*given, **more))
+    cpu_target.typing_context.refresh()
+    kinds, returned, calls = _types(function)
+    of_numba = len(applied)
+    with shortcuts.remembering():
+        found, also_returned, also_calls = _types(function)
+    assert (found, also_returned) == (kinds, returned)
+    assert list(map(str, also_calls.values())) == list(map(str, calls.values()))
+    assert len(applied) - of_numba < 0.75 * of_numba
+
+
+def test_a_warning_is_told_where_it_happened():
+    def calls(n):
+        return _warning(n)
+
+    with shortcuts.remembering(), warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        _types(calls)
+    line = calls.__code__.co_firstlineno + 1
+    assert [(str(one.message), one.lineno == line) for one in heard] == [("another", False), ("slow", True)]
+
+
+def test_a_type_that_cannot_be_is_told():
+    def mixes(n):
+        found = "text"
+        for i in range(n):
+            found = found + i
+        return found
+
+    with shortcuts.remembering(), pytest.raises(errors.TypingError, match="add"):
+        _types(mixes)
+
+
+@pytest.mark.parametrize("function", (_grows, _fills))
+def test_variables_are_renamed_as_numba_does_in_fewer_steps(function, monkeypatch):
+    steps = []
+    numbas = ssa._run_ssa_block_pass
+    monkeypatch.setattr(ssa, "_run_ssa_block_pass", lambda *given: steps.append(given) or numbas(*given))
+
+    def renamed():
+        steps.clear()
+        blocks = ssa.reconstruct_ssa(compiler.run_frontend(function)).blocks
+        return [(label, str(line)) for label, block in blocks.items() for line in block.body], len(steps)
+
+    lines, of_numba = renamed()
+    with shortcuts.remembering():
+        same, ours = renamed()
+    assert same == lines
+    assert ours < of_numba
 
 
 def test_code_is_made_for_what_operators_mean_to_numba():

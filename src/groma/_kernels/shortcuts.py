@@ -7,7 +7,8 @@ Python such as ``max``: a tenth of the time that Python takes of a compilation. 
 and tells whoever listens of every call of LLVM, though nobody does: another tenth. To count a reference to an array it
 takes the whole description apart: a fifth of the instructions for LLVM, without effect. Where it has no code for
 something it goes through all registries of code anew, some seven times in each function. It prepares for an error in
-every statement, and reads the arguments of each rule anew.
+every statement, and reads the arguments of each rule anew. It finds the type of every variable three times where once
+is enough, and goes through the whole function for each variable that it renames: another tenth.
 
 One answer is not Numba's: whether a number is finite. Numba tests ``x - x``, which is zero, and not NaN, for whatever
 sum ``x`` is, as soon as operations may be regrouped.
@@ -22,6 +23,7 @@ import builtins
 import math
 import operator
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -29,13 +31,15 @@ from typing import Any
 
 import llvmlite.binding as llvm
 from llvmlite import ir
-from numba.core import base, event, lowering, typeinfer, types
+from numba.core import base, event, lowering, ssa, typeinfer, types
+from numba.core import ir as numba_ir
 from numba.core.base import BaseContext
 from numba.core.compiler_machinery import register_pass
-from numba.core.errors import new_error_context  # type: ignore[attr-defined]
+from numba.core.errors import ForceLiteralArg, NumbaWarning, TypingError, new_error_context  # type: ignore[attr-defined]
 from numba.core.runtime.context import NRTContext
 from numba.core.targetconfig import TargetConfig
 from numba.core.typed_passes import NopythonTypeInference
+from numba.core.typeinfer import CallConstraint, ConstraintNetwork
 from numba.core.types.functions import BaseFunction
 
 _KNOWN = frozenset(
@@ -46,10 +50,13 @@ _KNOWN = frozenset(
 )
 #: Meaning of operators for types of operands, and the like, with what it was found in.
 _meanings: dict[Any, tuple[Any, Any]] = {}
+#: Where constraints say which variable they define.
+_DEFINED = ("target", "dst")
 #: What Numba calls the events around each call of LLVM.
 _LLVM_CALLS = "numba:llvm_lock"
 _call_type, _find_counts, _refresh = BaseFunction.get_call_type, NRTContext.get_meminfos, BaseContext.refresh
 _TRUTH = ir.IntType(1)
+_propagate, _to_single_assignment, _rewrite = ConstraintNetwork.propagate, ssa._run_ssa, ssa._run_block_rewrite
 _extract, _has_place = ir.IRBuilder.extract_value, cache(base._has_loc)
 
 
@@ -125,6 +132,83 @@ def _remembered_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
     if key not in _meanings:
         _meanings[key] = self, _call_type(self, context, args, kws)
     return _meanings[key][1]
+
+
+def _names(value: Any) -> Iterator[str]:
+    """Yield the variables in a part of a constraint, and other texts."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, numba_ir.Var):
+        yield value.name
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from _names(item)
+    elif isinstance(value, CallConstraint):
+        yield from _read(value)
+
+
+def _read(constraint: Any) -> list[str]:
+    """Return the variables that a constraint reads; one that it defines is a text."""
+    parts = [part for place, part in vars(constraint).items() if place not in _DEFINED or not isinstance(part, str)]
+    return list(_names(parts))
+
+
+def _is_settled(kind: Any) -> bool:
+    """Whether what a constraint makes of a type is the same each time."""
+    if kind is None or kind is types._undef_var or isinstance(kind, types.RecursiveCall):
+        return False
+    return kind.is_precise()
+
+
+def _propagated(self: Any, inferer: Any) -> list[Any]:
+    """Take the place of :meth:`ConstraintNetwork.propagate`: apply only constraints that read a new type.
+
+    Numba applies all of them until no type changes, the last time to find that none does.
+    """
+    errors: list[Any] = []
+    told: list[tuple[Any, warnings.WarningMessage]] = []
+    find = inferer.typevars.get
+    with warnings.catch_warnings(record=True) as heard:  # once, not for each constraint
+        warnings.simplefilter("always", NumbaWarning)
+        for constraint in self.constraints:
+            parts = vars(constraint)
+            if "groma_read" not in parts:
+                parts["groma_read"] = _read(constraint)
+            before = [found.type for name in parts["groma_read"] if (found := find(name)) is not None]
+            if before == parts.get("groma_seen"):
+                continue
+            try:
+                constraint(inferer)
+                raised = []
+            except (ForceLiteralArg, TypingError):  # again, for Numba to say what is wrong
+                one = ConstraintNetwork()
+                one.append(constraint)
+                raised = _propagate(one, inferer)
+            told.extend((constraint.loc, one) for one in heard)
+            heard.clear()
+            after = [found.type for place in _DEFINED if (found := find(parts.get(place))) is not None]
+            parts["groma_seen"] = None if raised or not all(map(_is_settled, before + after)) else before
+            errors.extend(raised)
+    for place, one in told:
+        with inferer.warnings.catch_warnings(place.filename, place.line):
+            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+    return errors
+
+
+def _in_single_assignment(blocks: Any) -> Any:
+    """Take the place of :func:`ssa._run_ssa`: rename a variable in the blocks that name it, not in all."""
+    named = {label: {found.name for one in block.body for found in one.list_vars()} for label, block in blocks.items()}
+
+    def rewrite(blocks: Any, states: Any, handler: Any) -> Any:
+        concerned = {label: block for label, block in blocks.items() if states["varname"] in named[label]}
+        others = {label: block.copy() for label, block in blocks.items()}
+        return {**others, **_rewrite(concerned, states, handler)}
+
+    ssa._run_block_rewrite = rewrite
+    try:
+        return _to_single_assignment(blocks)
+    finally:
+        ssa._run_block_rewrite = _rewrite
 
 
 def _counts(self: Any, builder: Any, ty: Any, val: Any) -> list[Any]:
@@ -212,6 +296,8 @@ def remembering() -> Iterator[None]:
         (BaseFunction, "get_call_type", _remembered_call_type),
         (NRTContext, "get_meminfos", _counts),
         (BaseContext, "refresh", _refreshed),
+        (ConstraintNetwork, "propagate", _propagated),
+        (ssa, "_run_ssa", _in_single_assignment),
         (TargetConfig, "values", _options),
         (ir.IRBuilder, "extract_value", _extracted),
         (base, "_has_loc", _has_place),
