@@ -65,7 +65,7 @@ html_theme = "furo"
 html_math_renderer = "drawn"
 html_title = f"groma {release}"
 html_static_path = ["_static"]
-html_css_files = ["versions.css"]
+html_css_files = ["layout.css", "versions.css"]
 html_js_files = ["versions.js"]
 templates_path = ["_templates"]
 # The theme's sidebar, with a choice of versions where the site has several (packaging/publish_documentation.py).

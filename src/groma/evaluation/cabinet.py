@@ -71,7 +71,7 @@ def sentences(numbers: dict[str, Any]) -> list[str]:
     size = " x ".join("?" if np.isnan(value) else f"{value:.2f}" for value in cabinet["size"])
     measured = " x ".join(f"{value:.2f}" for value in cabinet["size_measured"])
     lines = [
-        "Compared with what was measured and the map has not seen (its scale is taken from the motion capture):",
+        "Compared with measurements that the map does not use (its scale is taken from the motion capture):",
         f"  camera centres: {1000 * poses['before']['center_rmse']:.1f} mm -> "
         f"{1000 * poses['after']['center_rmse']:.1f} mm from the motion capture (rms)",
         f"  cabinet: {cabinet['num_edges']} of 12 edges have lines; {size} m, measured {measured} m",

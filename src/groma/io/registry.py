@@ -188,7 +188,7 @@ def check_target(scene: Scene, path: str | os.PathLike[str], format: str = "auto
     else:
         chosen = next((one for one in writable if one.name == format), None)
     if chosen is None:
-        known = _listed([one.target for one in writable if one.target])
+        known = "; ".join(one.target for one in writable if one.target)
         what = f"format {format!r}" if format != "auto" else f"the ending {suffix!r}"
         raise InputError(f"Cannot tell the format from {what} of {path}. Use {known}.")
     if chosen.check is not None:

@@ -66,7 +66,7 @@ def adjust(
         bool,
         _options.CAMERAS.option(
             "With the intrinsics: all principal points too. Default: those exactly in the middle of the image, which "
-            "nobody measured, with what is known of lenses.",
+            "were not measured, with a prior there.",
             "--refine-principal-point",
         ),
     ] = False,

@@ -31,7 +31,7 @@ def localize(
     images: Annotated[
         Path | None,
         _options.PLAIN.option(
-            "Folder of the photographs of the map; needed unless an earlier run indexed the map.", metavar="FOLDER"
+            "Folder of the photographs of the map. Default: the one recorded by groma map.", metavar="FOLDER"
         ),
     ] = None,
     calibration: Annotated[

@@ -15,7 +15,7 @@ from groma.errors import InputError
 
 def merge(
     console: Console,
-    first: Annotated[Path, typer.Argument(metavar="A", help="OUT of groma map, or a COLMAP model.")],
+    first: Annotated[Path, typer.Argument(metavar="A", help="OUT of groma map or groma track, or a COLMAP model.")],
     second: Annotated[Path, typer.Argument(metavar="B", help="A second map, of an overlapping place.")],
     output: Annotated[Path, _options.PLAIN.option("Folder for the results.", "--output", "-o", metavar="OUT")],
     first_images: Annotated[

@@ -37,7 +37,13 @@ function directionVariance({ kind, index }, along) {
   return quadratic(block, along);
 }
 const together = (...variances) => variances.some(v => v === null) ? null : Math.sqrt(Math.max(variances.reduce((a, b) => a + b, 0), 0));
-const withSigma = (value, sigma, suffix = "") => sigma === null ? number(value) + suffix : number(value) + " ± " + number(+sigma.toPrecision(2)) + suffix;
+// A value and its standard deviation end at the same digit, the second of the deviation.
+function withSigma(value, sigma, suffix = "") {
+  if (sigma === null) return number(value) + suffix;
+  const two = +sigma.toPrecision(2), places = Math.max(0, 1 - Math.floor(Math.log10(two)));
+  const text = two >= 1e-9 && two < 1e5 ? x => x.toFixed(places) : number;
+  return `${text(value)} ± ${text(two)}${suffix}`;
+}
 
 function pointSigma(name, i) {
   const found = covariances && symmetric(covariances[name], i, 3);
