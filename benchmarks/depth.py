@@ -124,7 +124,7 @@ def row_of(name: str, kind: str, given: dict, work: Path, confidence: float) -> 
     }  # fmt: skip
     if name == "cabinet":
         found = score_cabinet(scene, scores.alignment)
-        row |= {"edges": found.num_edges, "edge_mm": 1000.0 * found.distance}
+        row |= {"edges": found["num_edges"], "edge_mm": 1000.0 * found["distance"]}
     if "masks" in given:
         moved = given["truth"].keep(points=[]).replace(lines=scene.transformed(scores.alignment).lines)
         row["outside_3px"] = evaluate_silhouettes(moved, given["masks"]).to_dict()["outside_px"]["3"]

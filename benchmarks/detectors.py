@@ -82,7 +82,7 @@ def compared(source: LineScene, scene: Scene) -> dict:
         found, right = list(scores.recall_length.values()), list(scores.precision_count.values())
     elif source.name == "cabinet":
         cabinet = score_cabinet(scene, evaluate_poses(scene, read_scene(folder() / "motion_capture")).alignment)
-        found, right = [cabinet.num_edges / 12], [cabinet.num_lines / max(len(scene.lines), 1)]
+        found, right = [cabinet["num_edges"] / 12], [cabinet["num_lines"] / max(len(scene.lines), 1)]
     else:
         found, right = [], [float(scene.lines.confidence.mean())]
     return {"lines": len(lines), "found": found, "right": right}

@@ -15,7 +15,7 @@ FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 @pytest.fixture
 def lines(monkeypatch):
     monkeypatch.syspath_prepend(str(FOLDER))
-    for name in ("lines", "_line_curves", "_line_scenes", "_workshop"):
+    for name in ("lines", "_line_curves", "_line_scenes", "_workshop", "detectors"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     return importlib.import_module("lines")
 
@@ -64,3 +64,10 @@ def test_scenes_are_listed_or_made_of_a_kind_and_a_seed(lines):
         lines.UNSEEN.fullmatch(name) for name in ("stairs-3103", "boxes-1", "room-2", "wings-3", "gable-4", "tower-5")
     )
     assert not any(lines.UNSEEN.fullmatch(name) for name in (*lines.SCENES, "stairs", "spire-3", "stairs-3-4"))
+
+
+def test_the_cabinet_is_scored_for_the_table_of_detectors(lines):
+    """Its start has no lines: none of twelve edges is found, and nothing fails."""
+    detectors = importlib.import_module("detectors")
+    start = detectors.read_scene(detectors.folder() / "model")
+    assert detectors.compared(lines.LineScene("cabinet", start, []), start) == {"lines": 0, "found": [0.0], "right": [0.0]}
