@@ -155,6 +155,14 @@ def test_settings_of_orb_slam_hold_the_camera_and_the_unit_of_depths(tum, tmp_pa
         open_sequence(tum, camera=path)
 
 
+def test_of_a_pair_that_orb_slam_rectifies_the_left_camera_is_that_of_the_images(tmp_path):
+    matrix = "!!opencv-matrix\n   rows: 3\n   cols: 3\n   data: [40, 0, 30, 0, 41, 20, 0, 0, 1]\n"
+    lens = "LEFT.D: !!opencv-matrix\n   rows: 1\n   cols: 4\n   data: [-0.1, 0.02, 0, 0]\n"
+    (tmp_path / "settings.yaml").write_text(f"{ORB_SLAM}LEFT.K: {matrix}{lens}")
+    found = calibration_of(tmp_path / "settings.yaml")
+    assert found.size == (64, 48) and found.params.tolist() == [40, 41, 30.5, 20.5, -0.1, 0.02, 0, 0]
+
+
 def test_a_fisheye_of_orb_slam(tmp_path):
     path = tmp_path / "settings.yaml"
     text = ORB_SLAM.replace("PinHole", "KannalaBrandt8").replace("p1", "k3").replace("p2", "k4")

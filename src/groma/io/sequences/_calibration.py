@@ -193,6 +193,9 @@ def _of_orb_slam(entries: dict[str, str], name: str, path: Path) -> Calibration:
     words += [entries.get(f"{name}.{part}", "0") for part in lens]
     numbers, sides = np.array(finite(words, f"{path}, {name}")), ("Camera.width", "Camera.height")
     wide, high = (whole(entries.get(side, "0"), f"{path}, {side}") for side in sides)
+    if "LEFT.K.data" in entries:  # of a pair that ORB-SLAM rectifies: the other camera is that of its rectified images
+        matrix, distortion = (yaml_numbers(entries, f"LEFT.{letter}.data", path) for letter in "KD")
+        return from_opencv(np.append(matrix[[0, 4, 2, 5]], distortion), (wide, high))
     if is_fisheye:
         numbers[2:4] += 0.5
         found = _checked("OPENCV_FISHEYE", numbers, (wide, high), str(path))
