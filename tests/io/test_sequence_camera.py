@@ -45,6 +45,7 @@ def test_a_camera_of_a_sequence_is_checked(arguments, words):
         ("50 51 32 24", [50, 51, 32.5, 24.5]),
         ([50, 51, 32, 24], [50, 51, 32.5, 24.5]),
         ([[50, 0, 32], [0, 51, 24], [0, 0, 1]], [50, 51, 32.5, 24.5]),
+        ("50,51,32,24", [50, 51, 32.5, 24.5]),
         ("1 PINHOLE 64 48 50 51 32 24", [50, 51, 32, 24]),
         ("SIMPLE_PINHOLE 64 48 50 32 24", [50, 50, 32, 24]),
         (SequenceCamera("PINHOLE", np.array([50.0, 51, 32, 24]), 64, 48), [50, 51, 32, 24]),
@@ -124,6 +125,81 @@ def test_yaml_that_is_refused(tmp_path, text, words):
     assert str(tmp_path / "camera.yaml") in str(caught.value)
 
 
+ORB_SLAM = """%YAML:1.0
+Camera.type: "PinHole"
+Camera1.fx: 50.0
+Camera1.fy: 51.0
+Camera1.cx: 32.0
+Camera1.cy: 24.0
+Camera1.k1: -0.2
+Camera1.k2: 0.05
+Camera1.p1: 0.001
+Camera1.p2: 0.002
+Camera.width: 64
+Camera.height: 48
+RGBD.DepthMapFactor: 5208.0
+"""
+
+
+@pytest.mark.parametrize("text", [ORB_SLAM, ORB_SLAM.replace("Camera1", "Camera").replace("RGBD.", "")])
+def test_settings_of_orb_slam_hold_the_camera_and_the_unit_of_depths(tum, tmp_path, text):
+    path = tmp_path / "settings.yaml"
+    path.write_text(text)
+    found, same = calibration_of(path), calibration_of("50 51 32 24 -0.2 0.05 0.001 0.002")
+    assert found.model == same.model == "OPENCV" and found.depth_scale == 5208.0
+    np.testing.assert_array_equal(found.params, same.params)
+    assert open_sequence(tum, camera=path).preparation.depth_scale == 5208.0
+    assert open_sequence(tum, camera=path, depth_scale=1000.0).preparation.depth_scale == 1000.0
+    path.write_text(text.replace("5208.0", "-1"))
+    with pytest.raises(InputError, match="depth_scale must be positive"):
+        open_sequence(tum, camera=path)
+
+
+def test_of_a_pair_that_orb_slam_rectifies_the_left_camera_is_that_of_the_images(tmp_path):
+    matrix = "!!opencv-matrix\n   rows: 3\n   cols: 3\n   data: [40, 0, 30, 0, 41, 20, 0, 0, 1]\n"
+    lens = "LEFT.D: !!opencv-matrix\n   rows: 1\n   cols: 4\n   data: [-0.1, 0.02, 0, 0]\n"
+    (tmp_path / "settings.yaml").write_text(f"{ORB_SLAM}LEFT.K: {matrix}{lens}")
+    found = calibration_of(tmp_path / "settings.yaml")
+    assert found.size == (64, 48) and found.params.tolist() == [40, 41, 30.5, 20.5, -0.1, 0.02, 0, 0]
+
+
+def test_a_fisheye_of_orb_slam(tmp_path):
+    path = tmp_path / "settings.yaml"
+    text = ORB_SLAM.replace("PinHole", "KannalaBrandt8").replace("p1", "k3").replace("p2", "k4")
+    path.write_text(text.replace("5208.0", "0"))  # as in settings of cameras without depth
+    found = calibration_of(path)
+    assert (found.model, found.size, found.depth_scale) == ("OPENCV_FISHEYE", (64, 48), None)
+    assert found.params.tolist() == [50, 51, 32.5, 24.5, -0.2, 0.05, 0.001, 0.002]
+
+
+@pytest.mark.parametrize(
+    ("text", "scale"),
+    [
+        ('{"width": 64, "height": 48, "intrinsic_matrix": [50, 0, 0, 0, 51, 0, 32, 24, 1]}', None),
+        ('{"camera": {"w": 64, "h": 48, "fx": 50, "fy": 51, "cx": 32, "cy": 24, "scale": 6553.5}}', 6553.5),
+    ],
+)
+def test_cameras_of_open3d_and_replica(tum, text, scale):
+    (tum / "camera.json").write_text(text)
+    found = calibration_of(tum / "camera.json")
+    assert (found.model, found.size, found.depth_scale) == ("PINHOLE", (64, 48), scale)
+    assert found.params.tolist() == [50, 51, 32.5, 24.5]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[]", "expected an object"),
+        ("{}", "a finite number"),
+        ('{"intrinsic_matrix": [1, 2]}', "expected 9 finite numbers"),
+    ],
+)
+def test_other_json_is_refused(tmp_path, text, words):
+    (tmp_path / "camera.json").write_text(text)
+    with pytest.raises(InputError, match=words):
+        calibration_of(tmp_path / "camera.json")
+
+
 def test_matrix_file(tum):
     for text in ("50 0 32\n0 51 24\n0 0 1\n", "50 0 32 0\n0 51 24 0\n0 0 1 0\n0 0 0 1\n"):
         (tum / "camera.txt").write_text(text)
@@ -133,7 +209,7 @@ def test_matrix_file(tum):
 @pytest.mark.parametrize(
     ("camera", "words"),
     [
-        ("50 51 32", "Cannot read"),
+        ("50 51 32", "camera holds 3 numbers; expected 'fx fy cx cy'"),
         ([50, 51, 32], "3 numbers"),
         ("1 PINHOLE 64 48 50 51 32", "takes 4"),
         ("1 CIRCLE 64 48 50 51 32", "CIRCLE"),

@@ -44,7 +44,7 @@ def test_options(tum):
     assert mono.kind == "mono"
     assert next(iter(mono)).depth is None
     for options, words in (
-        ({"stride": 0}, "stride"), ({"max_frames": 0}, "max_frames"), ({"kind": "stereo"}, "rgbd"),
+        ({"stride": 0}, "stride"), ({"max_frames": 0}, "max_frames"), ({"kind": "stereo"}, "'rgbd' or 'mono'"),
         ({"depth_scale": 0}, "depth_scale"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=words):

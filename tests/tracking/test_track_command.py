@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """``groma track`` on a small rendered sequence in the layout of TUM RGB-D: what it writes, and what it refuses."""
 
+import errno
 import json
 import os
 import re
@@ -124,6 +125,17 @@ def test_finished_keyframes_are_on_disk_while_it_runs(tmp_path):
     assert [path.name for path in (tmp_path / "work").iterdir()] == ["lock"]
     journal.close()
     tracker.finish()
+
+
+def test_a_track_goes_on_where_nothing_can_be_kept(sequence, tmp_path, monkeypatch):
+    def full(*_given, **_options):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("groma.tracking.journal.write_tum", full)
+    result = _run(sequence, "-o", tmp_path / "out", "--camera", CAMERA, "--max-frames", 4)
+    assert result.exit_code == 0, result.output
+    assert "nothing was kept in" in result.output and os.strerror(errno.ENOSPC) in result.output
+    assert len(read_tum(tmp_path / "out" / "trajectory.txt")) == 4
 
 
 def test_two_runs_with_one_output_are_refused(sequence, tmp_path):

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ class CalibrationGates:
     """When a query has the camera of the map."""
 
     focal: float = gate(
-        0.1, "share", "by which the focal length in the file may differ from that of the map",
+        0.1, "share", "by which the focal length in the file may differ from that in files of the map, or of the map",
         "derived from focal lengths in files: good to some per cent",
     )  # fmt: skip
 
@@ -66,7 +67,11 @@ class CalibrationChoice:
 
 
 def calibration_of(
-    path: Path, size: tuple[int, int], of_map: QueryCamera | None, choice: CalibrationChoice
+    path: Path,
+    size: tuple[int, int],
+    of_map: QueryCamera | None,
+    choice: CalibrationChoice,
+    photograph: Path | None = None,
 ) -> Calibration:
     """Return the calibration of a photograph of a size (width, height).
 
@@ -78,6 +83,9 @@ def calibration_of(
         The camera of the map for images of this size.
     choice
         What the user said.
+    photograph
+        One that the camera of the map took. What its file tells is compared with what the query's tells: both are wrong
+        alike where photographs were cropped.
     """
     if choice.model is not None and choice.params is not None:
         return Calibration(QueryCamera(choice.model, np.array(choice.params), *size), False)
@@ -90,7 +98,8 @@ def calibration_of(
         return Calibration(of_map, False)
     focal = _focal_length(path) if choice.source in ("auto", "exif") else None
     if choice.source == "auto" and of_map is not None:
-        own = float(of_map.kind.focal_length(of_map.params))
+        own = None if focal is None or photograph is None else _focal_length_once(photograph)
+        own = own or float(of_map.kind.focal_length(of_map.params))
         if focal is None or abs(focal - own) <= GATES.focal * own:
             return Calibration(of_map, False)
     if focal is None:
@@ -105,3 +114,7 @@ def _focal_length(path: Path) -> float | None:
         bitmap = pycolmap.Bitmap.read(str(path), False)
     focal = None if bitmap is None else bitmap.exif_focal_length()
     return float(focal) if focal and np.isfinite(focal) and focal > 0 else None
+
+
+#: The same for a photograph of the map, which is read for the first query alone.
+_focal_length_once = lru_cache(_focal_length)

@@ -159,6 +159,12 @@ class Localizer:
         )
         return found[0] if alike else None
 
+    def photograph_of_map(self, width: int, height: int) -> Path | None:
+        """The first photograph of the map of this size; None where there is none."""
+        table, camera = self.scene.cameras, self.scene.images.camera_idx
+        rows = np.flatnonzero((table.width[camera] == width) & (table.height[camera] == height))
+        return self.files[rows[0]] if len(rows) else None
+
     def localize(
         self,
         image: str | os.PathLike[str] | npt.NDArray[np.generic],

@@ -91,7 +91,9 @@ def _localize(localizer: Localizer, name: str, path: Path, choice: CalibrationCh
     try:
         image = read_gray(path)
         size = image.shape[1], image.shape[0]
-        calibration = calibration_of(path, size, localizer.camera_of_map(*size), choice)
+        calibration = calibration_of(
+            path, size, localizer.camera_of_map(*size), choice, localizer.photograph_of_map(*size)
+        )
         return placed(name, localizer.localize(image, calibration.camera, calibration.refine))
     except GromaError as error:
         return unreadable(name, str(error))

@@ -6,6 +6,8 @@ from __future__ import annotations
 import os
 import shutil
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +16,7 @@ import numpy as np
 from groma.geometry import se3
 from groma.io import write_scene
 from groma.io.trajectories import write_tum
+from groma.mapping.checkpoints import system_reason
 from groma.mapping.folder_lock import LOCK, lock_folder
 from groma.tracking.map.keyframes import Followed
 
@@ -34,6 +37,7 @@ class Journal:
     Rows are those of TUM: time, place, quaternion; in ``frames.txt`` the number of the map follows. ``statuses.txt``
     has a row for every frame (time, status, numbers of points, lines and planes that agree, whether it is a keyframe),
     and ``now.npz`` the latest picture with its tracked features. The folder is locked until the journal is closed.
+    Once it cannot be written, as on a full disk, nothing more is noted, and the track goes on.
 
     Raises
     ------
@@ -43,6 +47,8 @@ class Journal:
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._lock = folder, lock_folder(folder)
+        #: Why nothing is noted any more, for the user; empty while all is well.
+        self.warnings: list[str] = []
         self.begin_anew()
 
     def begin_anew(self) -> None:
@@ -58,8 +64,22 @@ class Journal:
         """Give the folder free for others; what was noted stays."""
         self._lock.close()
 
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            self.warnings.append(
+                f"From some frame on nothing was kept in {self._folder} while the track ran: {system_reason(error)}."
+            )
+
     def frame(self, tracked: TrackedFrame, frame: Frame, tracker: Tracker) -> None:
         """Note what became of a frame, its pose if it has one, and now and then the picture."""
+        if not self.warnings:
+            with self._writing():
+                self._frame(tracked, frame, tracker)
+
+    def _frame(self, tracked: TrackedFrame, frame: Frame, tracker: Tracker) -> None:
         if tracked.pose is not None:
             self._append("frames.txt", tracked, str(tracked.submap))
         counts = [str(tracked.counts.get(kind, 0)) for kind in ("points", "lines", "planes")]
@@ -91,6 +111,11 @@ class Journal:
 
     def keyframe(self, tracker: Tracker, frame: TrackedFrame) -> None:
         """Note a keyframe that was just made."""
+        if not self.warnings:
+            with self._writing():
+                self._keyframe(tracker, frame)
+
+    def _keyframe(self, tracker: Tracker, frame: TrackedFrame) -> None:
         self._append("keyframes.txt", frame)
         began = time.monotonic()
         if began < self._next:

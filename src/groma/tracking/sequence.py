@@ -204,7 +204,8 @@ def track(
         tracker, completed = _follow(tracker, sequence, frames, progress, journal)
         progress(TrackProgress("adjusting all keyframes", 0, 1))
         result = tracker.finish()
-    warnings = [*sequence.warnings, *result.warnings, *_without_pose(frames)]
+    unkept = [] if journal is None else journal.warnings
+    warnings = [*sequence.warnings, *result.warnings, *_without_pose(frames), *unkept]
     if not len(result.trajectory):
         what = "could be tracked" if earlier is None else f"was found in the map {earlier.path}"
         check = "Check the camera and the depth scale." if sequence.kind == "rgbd" else "Check the camera."

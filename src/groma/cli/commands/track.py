@@ -30,8 +30,8 @@ def track(
     camera: Annotated[
         str | None,
         _options.CAMERAS.option(
-            "Calibration file (also YAML of Kalibr, ROS or OpenCV), or parameters in OpenCV's order: fx fy cx cy [k1 "
-            "k2 p1 p2 [k3 [k4 k5 k6]]]. Default: that of the sequence.",
+            "Calibration file (also YAML of Kalibr, ROS, OpenCV or ORB-SLAM, JSON of Open3D or Replica), or parameters "
+            "in OpenCV's order: fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]]. Default: that of the sequence.",
             metavar="CAMERA",
         ),
     ] = None,
@@ -67,7 +67,8 @@ def track(
     depth_scale: Annotated[
         float | None,
         _options.PLAIN.option(
-            "Depth values per metre. Default: that of the layout (TUM 5000, else 1000).", metavar="S"
+            "Depth values per metre. Default: that of the calibration file or of the layout (TUM 5000, else 1000).",
+            metavar="S",
         ),
     ] = None,
     force: _options.Force = False,

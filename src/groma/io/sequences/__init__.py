@@ -41,9 +41,11 @@ def open_sequence(
     camera : SequenceCamera, numbers, str or path, optional
         The camera, overriding that of the folder: ``fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]]`` as OpenCV
         counts (the first pixel's centre is (0, 0)), a line of COLMAP's ``cameras.txt`` (the first pixel's centre is
-        (0.5, 0.5)), or a file that holds one of these or a 3x3 matrix. Distorted images are undistorted.
+        (0.5, 0.5)), or a file that holds one of these, a 3x3 matrix, YAML of Kalibr, ROS, OpenCV or ORB-SLAM, or JSON
+        of Open3D or Replica. Distorted images are undistorted.
     depth_scale : float, optional
-        Depth values per metre, overriding those of the layout (TUM 5000, 7-Scenes 1000).
+        Depth values per metre, overriding those of the camera's file, and these those of the layout (TUM 5000,
+        7-Scenes 1000).
     stride : int
         Give every n-th frame.
     max_frames : int, optional
@@ -65,9 +67,11 @@ def open_sequence(
     """
     place = existing(path)
     selection = Selection(stride, max_frames, kind)
+    calibration = None if camera is None else calibration_of(camera)
+    if depth_scale is None and calibration is not None:
+        depth_scale = calibration.depth_scale
     if depth_scale is not None and not 0 < depth_scale < float("inf"):
         raise InputError(f"depth_scale must be positive (depth in files per metre); got {depth_scale}.")
-    calibration = None if camera is None else calibration_of(camera)
     wishes = Wishes(calibration, depth_scale, selection)
     for layout in layouts():
         if (root := layout.find(place)) is not None:

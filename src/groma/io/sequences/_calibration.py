@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence as Numbers
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ import numpy.typing as npt
 
 from groma import cameras
 from groma._typing import FloatArray, IntArray
+from groma.bounded.documents import member, number, of_kind, read_document, size, table
 from groma.bounded.text import finite, read_text, whole
 from groma.errors import FileFormatError, InputError
 from groma.io.reading import reading
@@ -27,14 +29,18 @@ from groma.io.sequences.frame import SequenceCamera, checked_params
 #: What callers may pass as a camera: a value, numbers, a line, or the name of a file.
 CameraLike = SequenceCamera | Numbers[float] | str | os.PathLike[str]
 #: Names under which a calibration may lie in the folder of a sequence.
-FILE_NAMES = ("cameras.txt", "camera.txt", "calibration.txt", "calib.txt", "intrinsics.txt", "camera-intrinsics.txt")
+FILE_NAMES = (
+    "cameras.txt", "camera.txt", "calibration.txt", "calib.txt", "intrinsics.txt", "camera-intrinsics.txt",
+    "camera_intrinsic.json", "cam_params.json",
+)  # fmt: skip
 
 #: Pixels whose rays are computed at a time (cost: memory).
 _BAND = 1 << 18
 
 _HELP = (
     "expected 'fx fy cx cy', 'fx fy cx cy k1 k2 p1 p2 [k3 [k4 k5 k6]]', a 3x3 or 4x4 matrix, a line of COLMAP's "
-    "cameras.txt ('1 PINHOLE 640 480 fx fy cx cy'), or a .yaml file of Kalibr, ROS or OpenCV"
+    "cameras.txt ('1 PINHOLE 640 480 fx fy cx cy'), a .yaml file of Kalibr, ROS, OpenCV or ORB-SLAM, or a .json file "
+    "of Open3D or Replica"
 )
 
 
@@ -48,6 +54,8 @@ class Calibration:
     params: FloatArray
     #: (width, height) in pixels; None: unknown.
     size: tuple[int, int] | None = None
+    #: Depth values per metre, where the file of the camera tells; None: unknown.
+    depth_scale: float | None = None
 
     @property
     def is_pinhole(self) -> bool:
@@ -121,10 +129,19 @@ def calibration_of(camera: CameraLike) -> Calibration:
     if not isinstance(camera, (str, os.PathLike)):
         return from_opencv(camera)
     text = os.fspath(camera)
+    words = text.replace(",", " ").split()
     # Path.is_file fails where a text is too long for a name.
-    if isinstance(camera, str) and not os.path.isfile(camera) and len(camera.split()) >= 4:
+    if isinstance(camera, str) and not os.path.isfile(camera) and (len(words) >= 4 or all(map(_is_number, words))):
         return _from_text(camera, "camera")
     return read_calibration(Path(text))
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -132,17 +149,21 @@ def read_calibration(path: Path) -> Calibration:
     with reading(path, "camera file"):
         if path.suffix.lower() in (".yaml", ".yml"):
             return calibration_in(yaml_entries(path), path)
+        if path.suffix.lower() == ".json":
+            return _from_document(read_document(path), path)
         return _from_text(read_text(path), str(path))
 
 
 def calibration_in(entries: dict[str, str], path: Path) -> Calibration:
-    """Return the camera in the entries of a YAML file of EuRoC, Kalibr, ROS or OpenCV.
+    """Return the camera in the entries of a YAML file of EuRoC, Kalibr, ROS, OpenCV or ORB-SLAM.
 
     Raises
     ------
     FileFormatError
         If it has none, or one of another model.
     """
+    if first := next((name for name in ("Camera1", "Camera") if f"{name}.fx" in entries), None):
+        return _of_orb_slam(entries, first, path)
     if "camera_matrix.data" in entries:
         lens = "distortion_coefficients.data"
         intrinsics = yaml_numbers(entries, "camera_matrix.data", path)[[0, 4, 2, 5]]
@@ -162,6 +183,40 @@ def calibration_in(entries: dict[str, str], path: Path) -> Calibration:
         center = intrinsics + np.array([0.0, 0.0, 0.5, 0.5])
         return _checked("OPENCV_FISHEYE", np.append(center, distortion), size, str(path))
     raise FileFormatError(f"{path}: distortion_model must be radial-tangential or equidistant; got {kind}.")
+
+
+def _of_orb_slam(entries: dict[str, str], name: str, path: Path) -> Calibration:
+    """Return the camera in the settings of ORB-SLAM: a pinhole with or without distortion, or KannalaBrandt8."""
+    is_fisheye = entries.get("Camera.type") == "KannalaBrandt8"
+    lens = ("k1", "k2", "k3", "k4") if is_fisheye else ("k1", "k2", "p1", "p2", "k3")
+    words = [entries[f"{name}.{part}"] for part in ("fx", "fy", "cx", "cy")]
+    words += [entries.get(f"{name}.{part}", "0") for part in lens]
+    numbers, sides = np.array(finite(words, f"{path}, {name}")), ("Camera.width", "Camera.height")
+    wide, high = (whole(entries.get(side, "0"), f"{path}, {side}") for side in sides)
+    if "LEFT.K.data" in entries:  # of a pair that ORB-SLAM rectifies: the other camera is that of its rectified images
+        matrix, distortion = (yaml_numbers(entries, f"LEFT.{letter}.data", path) for letter in "KD")
+        return from_opencv(np.append(matrix[[0, 4, 2, 5]], distortion), (wide, high))
+    if is_fisheye:
+        numbers[2:4] += 0.5
+        found = _checked("OPENCV_FISHEYE", numbers, (wide, high), str(path))
+    else:
+        found = from_opencv(numbers, (wide, high))
+    factor = entries.get("RGBD.DepthMapFactor", entries.get("DepthMapFactor", "0"))
+    return replace(found, depth_scale=finite([factor], f"{path}, DepthMapFactor")[0] or None)
+
+
+def _from_document(document: Any, path: Path) -> Calibration:
+    """Return the camera in a JSON file: Open3D's matrix by columns, or numbers by name as for Replica."""
+    content = of_kind(document, dict, path)
+    if "intrinsic_matrix" in content:
+        matrix = table([member(content, "intrinsic_matrix", list, path)], (9,), path)[0]
+        return from_opencv(matrix.reshape(3, 3).T, size(content, ("width", "height"), path))
+    content = of_kind(content.get("camera", content), dict, path)
+    numbers = [number(content, name, path) for name in ("fx", "fy", "cx", "cy")]
+    numbers += [number(content, name, path, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")]
+    sides = ("w", "h") if "w" in content else ("width", "height")
+    found = from_opencv(numbers, size(content, sides, path))
+    return replace(found, depth_scale=number(content, "scale", path, 0.0) or None)
 
 
 def find_calibration(folder: Path) -> Calibration | None:

@@ -64,7 +64,10 @@ class Selection:
     def kind_of(self, available: Kind) -> Kind:
         """Return the kind to give where ``available`` is what the files hold."""
         if self.kind not in (None, "mono", available):
-            raise InputError(f"The sequence is {available!r}, not {self.kind!r}. Pass kind={available!r} or 'mono'.")
+            others = "" if available == "mono" else " or 'mono'"
+            raise InputError(
+                f"The sequence is {available!r}, not {self.kind!r}. Pass {available!r}{others} as its kind."
+            )
         return self.kind or available
 
     def of(self, entries: list[Entry], warnings: list[str]) -> list[Entry]:

@@ -61,7 +61,7 @@ def open_two_folders(folder: Path, wishes: Wishes) -> FileSequence:
         Entry(time, path, depths[pairs[row]] if row in pairs else None)
         for row, (time, path) in enumerate(zip(times_of(folder, colors), colors, strict=True))
     ]
-    depth_scale = wishes.depth_scale
+    depth_scale = wishes.depth_scale or calibration.depth_scale
     if depth_scale is None:
         depth_scale = _scale(depths)
         if kind == "rgbd" and depth_scale != 1.0:

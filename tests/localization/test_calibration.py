@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Which calibration a query begins with: that of the map, what its file says, or none."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from groma.localization.calibration import CalibrationChoice, calibration_of
+from groma.localization.pose.camera import QueryCamera
+
+SIZE = (64, 48)
+OF_MAP = QueryCamera("SIMPLE_PINHOLE", np.array([100.0, 32.0, 24.0]), *SIZE)
+
+
+def _photograph(path, millimetres):
+    """A photograph whose file tells a focal length on film of 36 mm, or none."""
+    exif = Image.Exif()
+    if millimetres:
+        exif.get_ifd(0x8769)[0xA405] = millimetres
+    Image.new("L", SIZE).save(path, exif=exif)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("own", "of_the_map", "is_that_of_the_map"),
+    [
+        (None, None, True),
+        (54, None, True),  # 54 / 43.3 * 80 is 100 pixels
+        (24, None, False),
+        (24, 24, True),  # files that tell the focal length of photographs before they were cropped
+        (54, 24, False),  # another camera than that of the map
+        (None, 24, True),
+    ],
+)
+def test_what_a_file_tells_is_compared_with_what_files_of_the_map_tell(tmp_path, own, of_the_map, is_that_of_the_map):
+    query, other = _photograph(tmp_path / "query.jpg", own), _photograph(tmp_path / "map.jpg", of_the_map)
+    found = calibration_of(query, SIZE, OF_MAP, CalibrationChoice(), other)
+    assert (found.camera is OF_MAP, found.refine) == (is_that_of_the_map, not is_that_of_the_map)
+    if not is_that_of_the_map:
+        assert found.camera.params[0] == pytest.approx(own / np.hypot(36, 24) * np.hypot(*SIZE), rel=1e-3)
