@@ -19,6 +19,11 @@ def numbered(count: IntArray) -> tuple[IntArray, IntArray]:
     return owner, np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
 
 
+def pointers_of(count: npt.ArrayLike) -> IntArray:
+    """Return where groups of some sizes, one after the other, begin, and where the last one ends, (groups + 1,)."""
+    return np.concatenate([[0], np.cumsum(count, dtype=np.int64)])
+
+
 def connected_parts(first: IntArray, second: IntArray, count: int) -> IntArray:
     """Return the part (count,) of ``count`` things that each is in, where pairs are tied; parts by their first thing.
 

@@ -14,6 +14,7 @@ import dataclasses
 
 import numpy as np
 
+from groma._rows import pointers_of
 from groma._typing import IntArray
 from groma.problem._draft import Draft
 from groma.problem._partition import LANDMARK_KINDS, choose_landmarks, couplings, kept_classes
@@ -176,19 +177,12 @@ def _incidences(problem, group, e, order, layouts: list[FactorLayout], kept, tab
     return Eliminated(group, problem.variables[group].manifold.dof, count, order, incidences, cross)
 
 
-def _starts(landmark: IntArray, count: int) -> IntArray:
-    """Return the bounds (count + 1,) of the factors of each landmark, for landmarks in ascending order."""
-    starts = np.zeros(count + 1, np.int64)
-    np.cumsum(np.bincount(landmark, minlength=count), out=starts[1:])
-    return starts
-
-
 def _chunks(layouts: list[FactorLayout], eliminated: list[Eliminated], chunk_size: int) -> tuple[Chunk, ...]:
     """Cut the work into chunks of about ``chunk_size`` factors."""
     chunks = []
     for e, group in enumerate(eliminated):
         mine = [f for f, layout in enumerate(layouts) if layout.eliminated == e]
-        starts = [_starts(layouts[f].landmark, group.count) for f in mine]
+        starts = [pointers_of(np.bincount(layouts[f].landmark, minlength=group.count)) for f in mine]
         total = sum(starts, np.zeros(group.count + 1, np.int64))
         begin = 0
         while begin < group.count:

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from groma._rows import pointers_of
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assemble import disassemble
 from groma.adjustment.terms.lines import LINE_FACTORS
@@ -172,7 +173,7 @@ def triangulated_anew(scene: Scene, lines: IntArray) -> tuple[FloatArray, BoolAr
     planes = np.concatenate([normal, -np.einsum("ni,ni->n", normal, center)[:, None]], axis=1)
     usable: BoolArray = np.asarray(np.isfinite(planes).all(axis=1))
     weight = np.where(usable, np.linalg.norm(np.where(usable[:, None], normal, 0.0), axis=1), 0.0)
-    pointers = np.concatenate([[0], np.cumsum(np.bincount(table.line_idx[rows], minlength=scene.num_lines)[lines])])
+    pointers = pointers_of(np.bincount(table.line_idx[rows], minlength=scene.num_lines)[lines])
     result = triangulate_planes(planes, pointers, center, weight)
     found: BoolArray = np.asarray(line3.is_finite(result.line) & (np.abs(result.line) > 0).any(axis=1))
     return result.line, found

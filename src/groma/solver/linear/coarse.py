@@ -22,6 +22,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from groma._numba import loop
+from groma._rows import pointers_of
 from groma._simd import add_matvec, add_product, set_product, width
 from groma._typing import FloatArray, IntArray
 from groma.problem.gauge import gauge_directions
@@ -208,7 +209,7 @@ def _clusters(rows: IntArray, columns: IntArray, count: int) -> IntArray:
     ends = np.concatenate([rows, columns])
     order = argsort_by(((ends, count),), len(ends))
     neighbor = np.concatenate([columns, rows])[order]
-    pointer = np.concatenate([[0], np.cumsum(np.bincount(ends, minlength=count))])
+    pointer = pointers_of(np.bincount(ends, minlength=count))
     cluster = np.full(count, -1, np.int32)
     _grow(pointer, neighbor, max(CLUSTER_SIZE, -(-count // MAX_CLUSTERS)), cluster)
     return cluster
