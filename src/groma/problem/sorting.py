@@ -152,7 +152,15 @@ class PairTable:
         """Return (slots, pointer) of all pairs between the rows of two compressed lists."""
         return self._add(pointer_a, column_a, pointer_b, column_b, np.diff(pointer_a) * np.diff(pointer_b), False)
 
-    def _add(self, pointer_a, column_a, pointer_b, column_b, lengths, same: bool) -> tuple[IntArray, IntArray]:
+    def _add(
+        self,
+        pointer_a: IntArray,
+        column_a: IntArray,
+        pointer_b: IntArray,
+        column_b: IntArray,
+        lengths: IntArray,
+        same: bool,
+    ) -> tuple[IntArray, IntArray]:
         pair_pointer = pointers_of(lengths)
         slots = np.empty(pair_pointer[-1], np.int32)
         done = 0

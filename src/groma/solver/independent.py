@@ -216,10 +216,18 @@ class IndependentBlocks:
                 self._singular[e], self._steepest[e], dof,
             )  # fmt: skip
 
-    def _rescaled(self, states: States, costs, moved: States, new_costs, deltas, promised) -> States:
-        """Return what steps lead to that are tried at another length where their cost fell otherwise than promised.
+    def _rescaled(
+        self,
+        states: States,
+        costs: list[FloatArray],
+        moved: States,
+        new_costs: list[FloatArray],
+        deltas: list[FloatArray],
+        promised: list[FloatArray],
+    ) -> States:
+        """Try another length of the steps whose cost fell otherwise than promised; return the better states.
 
-        Those that are better take their place in new costs and steps.
+        ``new_costs`` and ``deltas`` are changed where the other length is better.
 
         A line seen along its length, or anything else that is bent and has large residuals, may bend the cost up: from
         twice the model's curvature on, full steps jump over the minimum to where the cost is higher, for ever. Damping

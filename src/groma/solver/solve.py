@@ -101,9 +101,11 @@ def solve(
     report.threads = options.threads or (available_cores() if report.num_factors >= FACTORS_FOR_THREADS else 1)
     workers = Workers(report.threads)
     try:
-        run = _evaluate if options.max_iterations == 0 else _minimised
         with one_blas_thread():
-            states = run(layout, workers, options, report, watch, progress)
+            if options.max_iterations:
+                states = _minimised(layout, workers, options, report, watch, progress)
+            else:
+                states = _evaluate(layout, workers, report, watch)
     finally:
         workers.close()
     warn_of_oddities(report)
@@ -192,9 +194,7 @@ def _improved(problem: DampedProblem[T], trial: T, best: T, share: float) -> tup
     return problem.refine(trial), True
 
 
-def _evaluate(
-    layout: Layout, workers: Workers, options: SolverOptions, report: SolveReport, watch: Stopwatch, progress
-) -> States:
+def _evaluate(layout: Layout, workers: Workers, report: SolveReport, watch: Stopwatch) -> States:
     """Find the costs at the start, and nothing else."""
     with watch("setup"):
         equations, states = NormalEquations(layout, workers), to_solver_order(layout)
@@ -210,8 +210,14 @@ def _evaluate(
 
 
 def _minimised(
-    layout: Layout, workers: Workers, options: SolverOptions, report: SolveReport, watch: Stopwatch, progress
+    layout: Layout,
+    workers: Workers,
+    options: SolverOptions,
+    report: SolveReport,
+    watch: Stopwatch,
+    progress: Progress | None,
 ) -> States:
+    """Minimise from the states of the layout's problem."""
     kind: type[Any] = JointProblem if layout.kept else IndependentProblem
     problem = kind(layout, workers, options, watch)
     report.linear_solver = problem.linear_name

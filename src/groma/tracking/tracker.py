@@ -50,6 +50,7 @@ from groma.tracking.outcome import (
     TrackedFrame,
     TrackResult,
 )
+from groma.tracking.pose.estimate import PoseEstimate
 from groma.tracking.pose.following import Attempt, find_lines_again, find_points_again, follow_frame, follow_nearby
 from groma.tracking.pose.initialise import Initialiser
 from groma.tracking.pose.prediction import MotionModel
@@ -286,19 +287,16 @@ class Tracker:
                 return self._report(data.frame, status, None, False, began, watch)
             self._mapper.metric = self._initialiser.metric
             self._present.followed, self._present.pose = self._initialiser.make_map(self.map)
-        self._present.data = data
-        self._initialiser = None
+        self._present.data, self._initialiser = data, None
         if len(self._mapper.maps) > 1:
             self._breaks.append((self._lost_since, data.frame.timestamp))
         self._lost_for = 0
-        if len(self.map.keyframes) > 1:
-            first = self.map.keyframes[0]
+        first = self.map.keyframes[0] if len(self.map.keyframes) > 1 else None
+        if first is not None:
             self._motion.update(None, first.pose, first.timestamp)
-            self._motion.update(first.pose, self._present.pose, data.frame.timestamp)
-        else:
-            self._motion.update(None, self._present.pose, data.frame.timestamp)
+        self._motion.update(None if first is None else first.pose, self._present.pose, data.frame.timestamp)
         self._present.frames_since_keyframe = 0
-        if len(self.map.keyframes) > 1:
+        if first is not None:
             self._mapper.adjust_start(self._present)
         for one in self.map.keyframes[:-1]:
             self._history.entries.append(Entry(one.timestamp, one.index, se3.identity(), self._mapper.current))
@@ -328,7 +326,11 @@ class Tracker:
             return self._start(data, began, watch)
         return self._report(data.frame, LOST, None, False, began, watch)
 
-    def _report(self, frame, status, estimate, is_keyframe, began, watch) -> TrackedFrame:
+    def _report(
+        self, frame: Frame, status: str, estimate: PoseEstimate | None, is_keyframe: bool, began: float,
+        watch: Stopwatch,
+    ) -> TrackedFrame:  # fmt: skip
+        """Note a frame with its pose, if the status has one, and return what became of it."""
         self.status = status
         has_pose = status in (TRACKED, FOUND, WEAK)
         if has_pose:

@@ -212,7 +212,7 @@ class Mapper:
             self.take_up(present, now=True)
         with watch("keyframe"):
             pose = se3.compose(chosen.relative[None], self.map.pose_of(chosen.near)[None])[0]
-            followed = add_keyframe(self.map, self.camera, chosen.data, pose, chosen.followed, self.options)
+            followed = add_keyframe(self.map, chosen.data, pose, chosen.followed)
             if chosen.data is present.data:
                 present.followed = followed
             elif present.data is not None:

@@ -23,6 +23,7 @@ from groma.tracking.map.track_map import TrackMap
 from groma.tracking.pose.estimate import PoseEstimate, estimate_pose
 from groma.tracking.pose.relocalise import match_planes
 from groma.tracking.pose.verification import misses_much
+from groma.tracking.stopwatch import Stopwatch
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ def follow_frame(
     followed: Followed,
     previous: FloatArray,
     expected: tuple[FloatArray, FloatArray],
-    watch,
+    watch: Stopwatch,
     pool: Executor | None = None,
     searched: bool = False,
 ) -> tuple[PoseEstimate | None, Followed]:
@@ -70,7 +71,7 @@ def follow_frame(
             )
     alive = track_map.points.alive[tracks.index]
     with watch("depth"):
-        measured = measure_points(data, tracks.take(alive), options, track_map, predicted, camera)
+        measured = measure_points(track_map, data, predicted, tracks.take(alive))
         if not options.points:
             measured = PointMeasurements.empty()
     # Planes before lines: where the thread beside is still busy with lines, this one finds the planes meanwhile.
