@@ -140,14 +140,9 @@ def _joined(parts: list[IntArray]) -> IntArray:
 
 
 def _incidences(
-    problem: Problem,
-    group: str,
-    e: int,
-    order: IntArray,
-    layouts: list[FactorLayout],
-    kept: Sequence[KeptClass],
+    problem: Problem, group: str, e: int, order: IntArray, layouts: list[FactorLayout], kept: Sequence[KeptClass],
     tables: dict[tuple[int, int], PairTable],
-) -> Eliminated:
+) -> Eliminated:  # fmt: skip
     """Find the landmark-block pairs of one eliminated group and number the pairs of the reduced system they fill.
 
     ``layouts`` get the numbers of these pairs, ``tables`` the pairs of kept blocks that share a landmark.

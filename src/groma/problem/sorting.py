@@ -153,14 +153,9 @@ class PairTable:
         return self._add(pointer_a, column_a, pointer_b, column_b, np.diff(pointer_a) * np.diff(pointer_b), False)
 
     def _add(
-        self,
-        pointer_a: IntArray,
-        column_a: IntArray,
-        pointer_b: IntArray,
-        column_b: IntArray,
-        lengths: IntArray,
+        self, pointer_a: IntArray, column_a: IntArray, pointer_b: IntArray, column_b: IntArray, lengths: IntArray,
         same: bool,
-    ) -> tuple[IntArray, IntArray]:
+    ) -> tuple[IntArray, IntArray]:  # fmt: skip
         pair_pointer = pointers_of(lengths)
         slots = np.empty(pair_pointer[-1], np.int32)
         done = 0

@@ -217,14 +217,9 @@ class IndependentBlocks:
             )  # fmt: skip
 
     def _rescaled(
-        self,
-        states: States,
-        costs: list[FloatArray],
-        moved: States,
-        new_costs: list[FloatArray],
-        deltas: list[FloatArray],
-        promised: list[FloatArray],
-    ) -> States:
+        self, states: States, costs: list[FloatArray], moved: States, new_costs: list[FloatArray],
+        deltas: list[FloatArray], promised: list[FloatArray],
+    ) -> States:  # fmt: skip
         """Try another length of the steps whose cost fell otherwise than promised; return the better states.
 
         ``new_costs`` and ``deltas`` are changed where the other length is better.

@@ -210,13 +210,9 @@ def _evaluate(layout: Layout, workers: Workers, report: SolveReport, watch: Stop
 
 
 def _minimised(
-    layout: Layout,
-    workers: Workers,
-    options: SolverOptions,
-    report: SolveReport,
-    watch: Stopwatch,
+    layout: Layout, workers: Workers, options: SolverOptions, report: SolveReport, watch: Stopwatch,
     progress: Progress | None,
-) -> States:
+) -> States:  # fmt: skip
     """Minimise from the states of the layout's problem."""
     kind: type[Any] = JointProblem if layout.kept else IndependentProblem
     problem = kind(layout, workers, options, watch)

@@ -25,7 +25,7 @@ from groma.geometry import se3
 from groma.io.sequences.frame import Frame, SequenceCamera
 from groma.io.trajectories import Trajectory
 from groma.scene import Scene
-from groma.tracking.backend.behind import Behind
+from groma.tracking.backend.deferred import DeferredTask
 from groma.tracking.backend.mapper import Mapper, Present
 from groma.tracking.backend.submaps import about_submaps
 from groma.tracking.ending import Ending
@@ -97,7 +97,7 @@ class Tracker:
         #: Times of the losses between the submaps, for the warnings.
         self._breaks: list[tuple[float, float]] = []
         #: Deferred work of the previous frame, and the rotation of the right camera if the assumed one was wrong.
-        self._behind = Behind(self.options.threaded)
+        self._deferred = DeferredTask(self.options.threaded)
         self._better: RightTurn | None = None
         #: Whether the previous frame had to be relocalised.
         self._searched = False
@@ -115,7 +115,7 @@ class Tracker:
             return None
         self._finished = True
         self._settle()
-        self._behind.close()
+        self._deferred.close()
         self._mapper.abandon()
         self._mapper.close()
         return Tracker(self._given, self.options, self._better, self._saved)
@@ -198,12 +198,12 @@ class Tracker:
 
     def _answer(self, tracked: TrackedFrame, at_once: bool = False) -> TrackedFrame:
         """Start the deferred work on the map for a frame, optionally with a keyframe of it at once."""
-        self._behind.begin(partial(self._mapper.advance, self._present, at_once))
+        self._deferred.begin(partial(self._mapper.advance, self._present, at_once))
         return tracked
 
     def _settle(self) -> None:
         """Wait for the deferred work of the previous frame."""
-        watch = self._behind.result()
+        watch = self._deferred.result()
         if watch is not None:
             self._history.note_stages(watch.seconds)
             self._better = self._mapper.better_turn
@@ -361,9 +361,9 @@ class Tracker:
         """
         self._finished, mapper, history = True, self._mapper, self._history
         ending = Ending(mapper, history)
-        self._behind.stand_still()
+        self._deferred.stand_still()
         ending.attempt("what followed the last frame", self._settle, None)
-        self._behind.close()
+        self._deferred.close()
         ending.settle(self._present)
         where = ending.join()
         roots = sorted({root for root, _ in where if mapper.maps[root].keyframes}) or [0]

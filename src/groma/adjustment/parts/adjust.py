@@ -22,18 +22,18 @@ import numpy as np
 from groma.adjustment.adjust import COUNTED_OTHERWISE
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.parts.checkpoint import FOLDER, Checkpoint, key_of
+from groma.adjustment.parts.communication import agreed
 from groma.adjustment.parts.cut import parts_of
 from groma.adjustment.parts.memory import room_for_parts
 from groma.adjustment.parts.opened import open_parts
 from groma.adjustment.parts.run import Run, Solved, Squares, Written
-from groma.adjustment.parts.together import agreed
 from groma.adjustment.report import AdjustReport, not_converged
 from groma.errors import InputError, OutputError
 from groma.factors.losses import Loss, Trivial
 from groma.solver.linear.blas import one_blas_thread
 from groma.solver.options import SolverOptions
-from groma.solver.reduce.alone import Alone
 from groma.solver.reduce.contract import Reducer
+from groma.solver.reduce.single import SingleProcess
 from groma.solver.report import SolveReport
 from groma.solver.solve import Progress
 
@@ -99,7 +99,7 @@ def adjust_parts(
     OutputError
         If archives exist in ``output`` already, or cannot be written.
     """
-    reducer, options = reducer or Alone(), options or SolverOptions()
+    reducer, options = reducer or SingleProcess(), options or SolverOptions()
     chosen = AssemblyOptions(**assembly)  # type: ignore[arg-type]
     paths = [Path(part) for part in parts]
     with agreed(reducer):

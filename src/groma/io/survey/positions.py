@@ -125,12 +125,9 @@ def _with_header(place: Path, rows: Sequence[tuple[int, list[str]]], columns: di
 
 
 def _places(
-    place: Path,
-    rows: Sequence[tuple[int, list[str]]],
-    names: list[str],
-    system: CoordinateSystem,
+    place: Path, rows: Sequence[tuple[int, list[str]]], names: list[str], system: CoordinateSystem,
     tail: Callable[[list[float], str], list[float]],
-) -> Places:
+) -> Places:  # fmt: skip
     """Return places of rows of a name, three coordinates, and what ``tail`` turns into three standard deviations."""
     found: dict[str, list[float]] = {}
     without_height = 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The reduced system at one place, for one damping after the other."""
+"""The reduced system at the present states, for one damping after the other."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ class Reduction:
         return cost
 
     def form(self, states: States, inputs: list[tuple], damping: float) -> None:
-        """Do the missing part of :meth:`linearize`: for another damping, landmarks are eliminated again.
+        """Form the reduced system for states and a damping, with as little work as the last call allows.
 
-        Compact equations are linearised for that, too.
+        For another damping alone landmarks are eliminated again; compact equations are linearised, too.
         """
         if states is not self._states or (damping != self._damping and self.equations.compact):
             self.linearize(states, inputs, damping)

@@ -36,11 +36,11 @@ from groma.solver.levenberg_marquardt import damping_from, predicted_decrease
 from groma.solver.linear.blas import one_blas_thread
 from groma.solver.linear.schur import ReducedSystem
 from groma.solver.options import DAMPING, SolverOptions, first_damping
-from groma.solver.reduce.alone import Alone
 from groma.solver.reduce.contract import Reducer
 from groma.solver.reduce.journal import Journal, Waypoint
 from groma.solver.reduce.shard import OpenShard, Shard, Shelf
 from groma.solver.reduce.shared_system import NUM_FOUND, SharedSystem
+from groma.solver.reduce.single import SingleProcess
 from groma.solver.report import SolveReport, Stopwatch
 from groma.solver.solve import Progress, minimise
 from groma.solver.standing import Standing
@@ -103,7 +103,7 @@ def solve_shards(
     ProblemError
         If landmarks are in no shard or in two, or a factor of a shard does not fit.
     """
-    options, reducer = options or SolverOptions(), reducer or Alone()
+    options, reducer = options or SolverOptions(), reducer or SingleProcess()
     _check(variables, shards, reducer)
     report = SolveReport()
     watch = Stopwatch(report)
