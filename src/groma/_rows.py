@@ -20,7 +20,7 @@ def numbered(count: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def pointers_of(count: npt.ArrayLike) -> IntArray:
-    """Return where groups of ``count`` items each, one after the other, begin, and where the last ends, (groups + 1,)."""
+    """Return where each of several groups of ``count`` items begins, and where the last one ends, (groups + 1,)."""
     return np.concatenate([[0], np.cumsum(count, dtype=np.int64)])
 
 

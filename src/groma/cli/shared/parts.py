@@ -141,7 +141,7 @@ def _checked(source: Path, output: Path | None, refused: dict[str, Any]) -> Path
 @contextmanager
 def _one_voice() -> Iterator[Reducer]:
     """Yield the reducer of this process. An error is printed once and ends all ranks."""
-    from groma.adjustment.parts.communication import ErrorOfAllRanks
+    from groma.adjustment.parts.communication import AllRanksError
     from groma.solver.reduce.mpi import Ranks, reducer_of_launcher, started_as
 
     try:
@@ -152,7 +152,7 @@ def _one_voice() -> Iterator[Reducer]:
         raise typer.Exit(1) from None  # rank 0 prints it
     try:
         yield reducer
-    except ErrorOfAllRanks:
+    except AllRanksError:
         if reducer.rank == 0:
             raise
         raise typer.Exit(1) from None
