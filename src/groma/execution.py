@@ -18,6 +18,7 @@ for any number of them, and are put together in their order.
 from __future__ import annotations
 
 import ctypes
+import operator
 import os
 import sys
 from collections import deque
@@ -272,7 +273,7 @@ def map_in_threads(function: Callable[[_Item], _Result], items: Sequence[_Item])
 
 def together(*functions: Callable[[], Any]) -> tuple[Any, ...]:
     """Call functions in threads of this process, and return their results in order."""
-    return tuple(map_in_threads(_called, functions))
+    return tuple(map_in_threads(operator.call, functions))
 
 
 def begin(function: Callable[[], _Result]) -> Callable[[], _Result]:
@@ -324,10 +325,6 @@ def map_ranges(function: Callable[[slice], Any], count: int, size: int) -> None:
     The rows of a slice must depend on no other row.
     """
     map_in_threads(function, [slice(first, min(first + size, count)) for first in range(0, count, size)])
-
-
-def _called(function: Callable[[], _Result]) -> _Result:
-    return function()
 
 
 def _each(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_Result]:

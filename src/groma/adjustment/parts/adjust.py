@@ -161,6 +161,7 @@ def _tidy(output: Path, paths: Sequence[Path], checkpoint: Checkpoint) -> None:
 def _result(run: Run, output: Path, solved: Solved, written: Written) -> PartsResult:
     """Say what an adjustment did."""
     opened, before, after = run.opened, [fact["squares"] for fact in run.opened.facts], written.squares
+    kinds = sorted({kind for part in before for kind in part}, reverse=True)
     measurements: dict[str, int] = {}
     for fact in opened.facts:
         for name, count in fact["measurements"].items():
@@ -173,7 +174,7 @@ def _result(run: Run, output: Path, solved: Solved, written: Written) -> PartsRe
         num_lines=opened.total("lines"),
         num_planes=opened.num_planes,
         num_observations=opened.total("observations"),
-        rmse_px={kind: {"before": _rms(before, kind), "after": _rms(after, kind)} for kind in _kinds(before)},
+        rmse_px={kind: {"before": _rms(before, kind), "after": _rms(after, kind)} for kind in kinds},
         inliers={},
         sigma0=None,
         solve=solved.report,
@@ -183,10 +184,6 @@ def _result(run: Run, output: Path, solved: Solved, written: Written) -> PartsRe
         num_measurements=measurements,
     )
     return PartsResult(tuple(output / path.name for path in opened.paths), solved.report, warnings, adjustment)
-
-
-def _kinds(squares: Squares) -> list[str]:
-    return sorted({kind for part in squares for kind in part}, reverse=True)
 
 
 def _rms(squares: Squares, kind: str) -> float:
