@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from groma._simd import width
+from groma._stopwatch import Stopwatch
 from groma._typing import BoolArray, FloatArray
 from groma.gates import gate
 from groma.problem.layout import Chunk, Layout
@@ -23,7 +24,7 @@ from groma.problem.parallel import Workers
 from groma.solver.damped_problem import Trial
 from groma.solver.linear.schur import MIN_DIAGONAL, invert_blocks
 from groma.solver.options import SolverOptions, first_damping
-from groma.solver.report import SolveReport, Stopwatch, note_costs
+from groma.solver.report import SolveReport, note_costs
 from groma.solver.steps import States
 from groma.solver.termination import Termination
 

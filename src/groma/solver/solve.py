@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from groma._stopwatch import Stopwatch
 from groma._typing import FloatArray
 from groma.errors import check_kind
 from groma.execution import available_cores
@@ -36,7 +37,7 @@ from groma.solver.independent import STRETCH, IndependentProblem, stretch_factor
 from groma.solver.joint import JointProblem
 from groma.solver.linear.blas import one_blas_thread
 from groma.solver.options import SolverOptions
-from groma.solver.report import Iteration, SolveReport, Stopwatch, count_unknowns, note_costs, warn_of_oddities
+from groma.solver.report import Iteration, SolveReport, count_unknowns, note_costs, warn_of_oddities
 from groma.solver.standing import Standing
 from groma.solver.steps import States
 from groma.solver.termination import Criteria, Termination, is_beyond_cost
@@ -90,7 +91,7 @@ def solve(
     check_kind(problem, Problem, "problem", "Make one: groma.Problem(variables, factors).")
     options = options or SolverOptions()
     report = SolveReport(num_factors=sum(map(len, problem.factors)), num_residuals=problem.num_residuals)
-    watch = Stopwatch(report)
+    watch = Stopwatch(report.seconds)
     with watch("setup"):
         parts, layout = (layouts or Layouts()).of(problem, options.eliminate)
     report.notes += layout.warnings

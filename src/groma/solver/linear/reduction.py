@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
+from groma._stopwatch import Stopwatch
 from groma._typing import FloatArray
 from groma.problem.layout import Chunk
 from groma.problem.linearization import NormalEquations
 from groma.solver.linear.contract import LinearSolver
 from groma.solver.linear.schur import ReducedSystem
-from groma.solver.report import Stopwatch
 from groma.solver.steps import States
 
 

@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 
+from groma._stopwatch import Stopwatch
 from groma._typing import FloatArray
 from groma.features.point_tracks import POINT_TRACKS, follow
 from groma.tracking.beside import beside
@@ -23,7 +24,6 @@ from groma.tracking.map.track_map import TrackMap
 from groma.tracking.pose.estimate import PoseEstimate, estimate_pose
 from groma.tracking.pose.relocalise import match_planes
 from groma.tracking.pose.verification import misses_much
-from groma.tracking.stopwatch import Stopwatch
 
 
 @dataclass(frozen=True)
