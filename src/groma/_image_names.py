@@ -39,8 +39,9 @@ def rows_by_name(wanted: Sequence[str], known: Sequence[str]) -> IntArray:
     for short in (str.lower, _without_ending):
         _by_ends(found, wanted, known, short)
     agreed = any(row >= 0 and "/" in wanted[place] and "/" in known[row] for place, row in enumerate(found.tolist()))
-    for short in () if agreed else (str.lower, _without_ending):
-        _by_files(found, wanted, known, short)
+    if not agreed:
+        for short in (str.lower, _without_ending):
+            _by_files(found, wanted, known, short)
     return found
 
 

@@ -14,13 +14,20 @@ from groma._typing import BoolArray, IntArray
 
 
 def numbered(count: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the group of each item, and its number in the group, of groups of some sizes one after the other."""
+    """Return for groups of ``count`` items each, one after the other: the group of each item, its number in it."""
     owner = np.repeat(np.arange(len(count)), count)
     return owner, np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
 
 
+def pointers_of(count: npt.ArrayLike) -> IntArray:
+    """Return where each of several groups of ``count`` items begins, and where the last one ends, (groups + 1,)."""
+    return np.concatenate([[0], np.cumsum(count, dtype=np.int64)])
+
+
 def connected_parts(first: IntArray, second: IntArray, count: int) -> IntArray:
-    """Return the part (count,) of ``count`` things that each is in, where pairs are tied; parts by their first thing.
+    """Return the connected component (count,) of each node of a graph, numbered by their first nodes.
+
+    Edge k joins the nodes ``first[k]`` and ``second[k]`` of ``count``.
 
     In a round every part is joined to the lowest of those it is tied to. ``scipy.sparse.csgraph`` takes as long, and
     a quarter of a second to import.
@@ -44,7 +51,7 @@ def column(*shape: int, dtype: npt.DTypeLike = np.float64) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """A row an item; every field is declared with :func:`column`."""
+    """Columns of equal length, one row per item; every field is declared with :func:`column`."""
 
     def __len__(self) -> int:
         return len(next(iter(vars(self).values())))

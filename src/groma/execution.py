@@ -18,6 +18,7 @@ for any number of them, and are put together in their order.
 from __future__ import annotations
 
 import ctypes
+import operator
 import os
 import sys
 from collections import deque
@@ -138,13 +139,13 @@ def num_workers() -> int:
 
 
 def num_threads() -> int:
-    """Return how many threads of this process do what is not sent to others, one without :func:`work_with`."""
+    """Return how many threads of this process do the work that is not sent to others, one without :func:`work_with`."""
     crew = _CREW.get()
     return 1 if crew is None else crew.here.workers
 
 
 def num_calls() -> int:
-    """Return into how many calls work is divided that is sent to other processes; zero where they share memory."""
+    """Return into how many calls work for other processes is divided; zero where all workers share memory."""
     crew = _CREW.get()
     return 0 if crew is None or crew.executor is None or crew.shares_memory else _CALLS * crew.workers
 
@@ -152,7 +153,7 @@ def num_calls() -> int:
 def map_work(
     function: Callable[[_Item], _Result], items: Sequence[_Item], progress: Callable[[int, int], None] | None = None
 ) -> list[_Result]:
-    """Return the results of a function of every item, in the order of the items.
+    """Apply a function to every item, and return the results in the order of the items.
 
     Parameters
     ----------
@@ -202,10 +203,10 @@ def take_in_turn(
     items: Sequence[_Item],
     progress: Callable[[int, int], None] | None = None,
 ) -> list[_Result]:
-    """Return the results of a function of every item, of which this thread and helpers take the next one in turn.
+    """Apply a function to every item; this thread and some helpers of an executor each take the next item in turn.
 
-    Nobody is woken for a piece. Helpers that other work keeps busy are not waited for, and what any piece raises ends
-    the work and is raised here. ``progress`` is that of :func:`map_work`, after the first call.
+    No thread is woken for a single item. Helpers that are busy with other work are not waited for, and what any call
+    raises ends the work and is raised here. ``progress`` is that of :func:`map_work`, after the first call.
     """
     total, said = len(items), 0
     found: dict[int, _Result] = {}
@@ -249,7 +250,7 @@ def map_largest_first(
     sizes: Sequence[float],
     progress: Callable[[int, int], None] | None = None,
 ) -> list[_Result]:
-    """Do what :func:`map_work` does, the largest items first: at the end all workers then wait for a small one.
+    """Do what :func:`map_work` does, the largest items first, so that at the end workers wait for a small one only.
 
     ``sizes`` are about in proportion to the time that the items take.
     """
@@ -261,7 +262,7 @@ def map_largest_first(
 def map_in_threads(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_Result]:
     """Do what :func:`map_work` does in threads of this process.
 
-    It is for pieces that share more memory than they are worth: they are not sent to other processes.
+    For items whose data cost more to send to another process than the work on them.
     """
     crew = _CREW.get()
     if crew is None or crew.here.workers < 2:
@@ -271,15 +272,15 @@ def map_in_threads(function: Callable[[_Item], _Result], items: Sequence[_Item])
 
 
 def together(*functions: Callable[[], Any]) -> tuple[Any, ...]:
-    """Return what some functions return, which are called in threads of this process."""
-    return tuple(map_in_threads(_called, functions))
+    """Call functions in threads of this process, and return their results in order."""
+    return tuple(map_in_threads(operator.call, functions))
 
 
 def begin(function: Callable[[], _Result]) -> Callable[[], _Result]:
-    """Begin something in a thread of this process whose result is asked for later; return what gives it.
+    """Start a function in a thread of this process; return a callable that gives its result.
 
-    What no thread has begun by then is done by who asks, and so is everything without workers. It must change nothing:
-    where what goes on meanwhile fails, nobody waits for it.
+    If no thread has started it when the result is asked for, or without workers, the caller runs it. The function must
+    have no side effects: if the work in between fails, nobody waits for it.
 
     Examples
     --------
@@ -299,10 +300,10 @@ def begin(function: Callable[[], _Result]) -> Callable[[], _Result]:
 
 @contextmanager
 def beside(function: Callable[[], object]) -> Iterator[None]:
-    """Call a function in a thread of this process while the block goes on; without workers, when it has ended.
+    """Run a function in a thread of this process during the block; without workers, after it.
 
-    Unlike what :func:`begin` begins, it may write: the block does not end before it. What it raises is raised at the
-    end of the block, unless the block itself has raised.
+    Unlike that of :func:`begin`, the function may write: the block ends after it. What it raises is raised at the end
+    of the block, unless the block itself has raised.
     """
     crew = _CREW.get()
     executor = None if crew is None else crew.here.executor
@@ -319,15 +320,11 @@ def beside(function: Callable[[], object]) -> Iterator[None]:
 
 
 def map_ranges(function: Callable[[slice], Any], count: int, size: int) -> None:
-    """Call a function that writes into arrays with slices of ``size`` rows that cover ``count``, in threads.
+    """Call a function that writes into arrays in threads, with slices of ``size`` rows that cover ``count`` rows.
 
     The rows of a slice must depend on no other row.
     """
     map_in_threads(function, [slice(first, min(first + size, count)) for first in range(0, count, size)])
-
-
-def _called(function: Callable[[], _Result]) -> _Result:
-    return function()
 
 
 def _each(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_Result]:

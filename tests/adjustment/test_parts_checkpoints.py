@@ -15,7 +15,7 @@ from groma.factors.losses import Cauchy, GemanMcClure
 from groma.scene import Similarity, synthetic
 from groma.scene.measurements import PosePriors
 from groma.solver.options import SolverOptions
-from groma.solver.reduce.alone import Alone
+from groma.solver.reduce.single import SingleProcess
 
 OPTIONS = SolverOptions(threads=1)
 LOSSES = Cauchy(1.0), GemanMcClure(2.0)
@@ -133,7 +133,7 @@ def test_parts_in_memory_give_the_same(parts, tmp_path):
     assert same_bytes(tmp_path / "always", tmp_path / "never") and same_bytes(tmp_path / "auto", tmp_path / "never")
     with pytest.raises(InputError, match="keep must be"):
         adjust_parts(parts, tmp_path / "x", keep="sometimes")
-    assert room_for_parts("never", Alone()) == 0.0 < room_for_parts("auto", Alone()) < free_memory()
+    assert room_for_parts("never", SingleProcess()) == 0.0 < room_for_parts("auto", SingleProcess()) < free_memory()
 
 
 def test_parts_of_an_earlier_result_go(parts, tmp_path):

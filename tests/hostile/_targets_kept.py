@@ -31,8 +31,8 @@ from groma.mapping.checkpoint_files import ADJUSTED, ARRAY, DEPTHS, LINE_MAP, PL
 from groma.mapping.depth.points import MeasuredDepths
 from groma.mapping.posed.placed import PlacedPhotographs
 from groma.scene import Cameras, Points, Scene, synthetic
-from groma.solver.reduce.alone import Alone
 from groma.solver.reduce.journal import Waypoint
+from groma.solver.reduce.single import SingleProcess
 from groma.solver.standing import Standing
 from groma.tracking.saved import read_saved_map
 from groma.viz.report.covariances import read_covariances
@@ -93,18 +93,18 @@ def _parts(work: Path) -> Iterator[Made]:
     """Yield a scene in parts, and the checkpoint of its adjustment."""
     write_parts(SMALL.points_only(), work, observations=60)
     parts = _files(work)
-    yield "parts", parts, lambda folder: open_parts(parts_of(folder), AssemblyOptions(), Alone())
+    yield "parts", parts, lambda folder: open_parts(parts_of(folder), AssemblyOptions(), SingleProcess())
     for name, content in parts.items():
         (work / name).write_bytes(content)
-    opened = open_parts(parts_of(work), AssemblyOptions(), Alone())
-    checkpoint = Checkpoint(work / ".checkpoint", "key", opened, Alone())
+    opened = open_parts(parts_of(work), AssemblyOptions(), SingleProcess())
+    checkpoint = Checkpoint(work / ".checkpoint", "key", opened, SingleProcess())
     standing = Standing(2.0, 1.0, (), None)
     states = {name: group.state for name, group in opened.variables.items()}
     checkpoint.keep(states, Waypoint(standing, 1e-4, 1.0, 1.0))
     yield (
         "parts_checkpoint",
         _files(work / ".checkpoint"),
-        lambda folder: Checkpoint(folder, "key", opened, Alone()).load(),
+        lambda folder: Checkpoint(folder, "key", opened, SingleProcess()).load(),
     )
     shutil.rmtree(work)
     work.mkdir()

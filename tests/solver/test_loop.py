@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from problems import INTRINSICS, cameras_on_a_ring, pixels_of, scene_problem
 
+from groma._stopwatch import Stopwatch
 from groma.errors import InputError
 from groma.factors import PointReprojection, VectorPrior
 from groma.factors.contract import Ref
@@ -16,7 +17,7 @@ from groma.problem.variables import Variables
 from groma.solver.damped_problem import Trial
 from groma.solver.levenberg_marquardt import MAX_DAMPING, NielsenDamping
 from groma.solver.options import SolverOptions
-from groma.solver.report import SolveReport, Stopwatch
+from groma.solver.report import SolveReport
 from groma.solver.solve import minimise, solve
 from groma.solver.termination import Termination
 
@@ -89,7 +90,7 @@ class Curve:
 
 def run(problem, progress=None, **options):
     report = SolveReport()
-    report.termination = minimise(problem, SolverOptions(**options), report, Stopwatch(report), progress)
+    report.termination = minimise(problem, SolverOptions(**options), report, Stopwatch(report.seconds), progress)
     return report
 
 

@@ -12,11 +12,11 @@ import groma.solver.reduce.shards as shards_module
 from groma.errors import InputError
 from groma.solver.linear.coarse import coarse_space
 from groma.solver.options import SolverOptions
-from groma.solver.reduce.alone import Alone
 from groma.solver.reduce.shards import solve_shards
+from groma.solver.reduce.single import SingleProcess
 
 
-class Counting(Alone):
+class Counting(SingleProcess):
     """One process that remembers how much it sums."""
 
     def __init__(self):

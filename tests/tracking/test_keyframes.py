@@ -5,6 +5,7 @@ import _room
 import numpy as np
 import pytest
 
+from groma._stopwatch import Stopwatch
 from groma.geometry import se3
 from groma.tracking import Tracker, TrackOptions
 from groma.tracking.backend.mapper import Mapper
@@ -16,7 +17,6 @@ from groma.tracking.map.landmarks import ALIVE
 from groma.tracking.map.points import PointTracks, find_again
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.pose.verification import PoseVerification, misses_much
-from groma.tracking.stopwatch import Stopwatch
 
 OPTIONS = TrackOptions(num_points=250, num_features=500)
 

@@ -249,7 +249,7 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
         reports.append(solution.report)
         if stopped:
             break
-        for renew in () if last or not options.max_iterations else (renew_lines, settle_clusters):
+        for renew in (renew_lines, settle_clusters) if options.max_iterations and not last else ():
             problem, renewed = with_held_states(problem, *renew(scene, problem, options.threads))
             moved.append(renewed)
         if not isinstance(loss, Trivial) and solution.report.iterations:
@@ -364,9 +364,9 @@ def _landmark_steps(options: AdjustOptions, loss: Loss, problem: Problem) -> int
     """Lines and robust losses leave a long tail of small joint steps; a few cheap steps of landmarks cut it short."""
     if options.landmark_steps is not None:
         return options.landmark_steps
-    if not isinstance(loss, Trivial):
-        return 2
-    return 0 if "lines" not in problem.variables else 1 if _is_coupled(problem) else 2
+    if isinstance(loss, Trivial) and "lines" not in problem.variables:
+        return 0
+    return 1 if isinstance(loss, Trivial) and _is_coupled(problem) else 2
 
 
 def _is_coupled(problem: Problem) -> bool:

@@ -17,6 +17,7 @@ from groma.adjustment.terms.camera_poses import held_scale
 from groma.adjustment.terms.objects import with_held
 from groma.adjustment.terms.principal_points import with_principal_points_known_to
 from groma.errors import InputError, ProblemError
+from groma.geometry import so3
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.scene import Scene
@@ -125,7 +126,7 @@ def uncertainty(
     moved = scene.transformed(near)
     found = _uncertainty(moved, options, gauge, sigma0, None if problem is None else at_places_of(problem, moved))
     lines, planes = np.eye(6), np.eye(4)
-    lines[:3, 3:], planes[3, :3] = _hat(-near.translation[None])[0], near.translation
+    lines[:3, 3:], planes[3, :3] = so3.hat(-near.translation), near.translation
     return replace(found, lines=lines @ found.lines @ lines.T, planes=planes @ found.planes @ planes.T)
 
 
@@ -213,7 +214,10 @@ def _exact_calibration(problem: Problem) -> str:
 
 
 def _landmark_factors(scene: Scene, problem: Problem, gauge: str) -> FloatArray:
-    """By what the deviations (F, 2) of centres and rotations are larger when landmarks are left out one by one."""
+    """Return the factors (F, 2) by which leaving out landmarks one by one enlarges the deviations of each frame.
+
+    The first is that of the centre, the second that of the rotation.
+    """
     from groma.adjustment.misfit.jackknife import landmark_jackknife, observations_alone
 
     covariances = _covariances(scene, AssemblyOptions(planes=False), gauge, observations_alone(problem))[1]
@@ -227,19 +231,15 @@ def _landmark_factors(scene: Scene, problem: Problem, gauge: str) -> FloatArray:
 def _covariances(
     scene: Scene, options: AssemblyOptions, gauge: str, problem: Problem | None, sigma0: float = 1.0
 ) -> tuple[str, Covariances]:
-    """Return the gauge that was chosen, and the covariances in it; sigma0 is what they are multiplied by the square of.
+    """Return the gauge that was chosen, and the covariances in it, which the caller multiplies by ``sigma0`` squared.
 
-    What is known of lenses beforehand does not depend on the noise: it is divided by that square.
+    What is known of lenses beforehand does not depend on the noise, and is divided by that square here.
     """
-    if gauge == "auto":
+    if gauge == "auto" and scene.is_tied:
+        gauge = "measured"
+    elif gauge == "auto":
         metric = options.planes and len(scene.relations) > 0 and options.structure_form == "metric"
-        gauge = (
-            "measured"
-            if scene.is_tied
-            else "held"
-            if metric or scene.is_metric or len(scene.camera_motions)
-            else "inner"
-        )
+        gauge = "held" if metric or scene.is_metric or len(scene.camera_motions) else "inner"
     if problem is None:
         held = "first_camera" if gauge == "held" else "free"
         problem = assemble(scene, replace(options, gauge=held)).problem
@@ -313,12 +313,8 @@ def _ends(scene: Scene, lines: FloatArray) -> FloatArray:
     d = scene.lines.segments[:, 1] - scene.lines.segments[:, 0]
     d = d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-300)
     out = np.empty((len(d), 2, 3, 3))
-    across = _hat(d)
+    across = so3.hat(d)
     for k in range(2):
-        J = np.concatenate([across, -across @ _hat(scene.lines.segments[:, k])], axis=2)
+        J = np.concatenate([across, -across @ so3.hat(scene.lines.segments[:, k])], axis=2)
         out[:, k] = J @ lines @ np.swapaxes(J, 1, 2)
     return out
-
-
-def _hat(v: FloatArray) -> FloatArray:
-    return np.cross(v[:, None, :], np.eye(3)[None]).swapaxes(1, 2)

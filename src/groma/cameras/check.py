@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -107,7 +107,7 @@ def _points_in_cone(rng: np.random.Generator, half_angle: float, count: int) -> 
     return depth[:, None] * np.stack([sine * np.cos(around), sine * np.sin(around), np.cos(theta)], axis=1)
 
 
-def _central_differences(function, argument: FloatArray) -> FloatArray:
+def _central_differences(function: Callable[[FloatArray], FloatArray], argument: FloatArray) -> FloatArray:
     """Derivative (N, 2, columns) of ``function`` by the columns of ``argument`` (N, columns)."""
     columns = []
     for j in range(argument.shape[1]):

@@ -126,7 +126,9 @@ def _count(threads: int | None) -> int:
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     wanted = min(usable, threads or usable, _MOST)
     said = os.environ.get(VARIABLE, "")
-    return int(said) if said.isdigit() else wanted if wanted > 1 else 0
+    if said.isdigit():
+        return int(said)
+    return wanted if wanted > 1 else 0
 
 
 def _end_with_the_command(forked: list[int]) -> None:

@@ -21,6 +21,7 @@ import numpy as np
 import scipy  # its parts are imported when something of them is first used
 
 from groma._numba import exact_kernel, loop
+from groma._rows import pointers_of
 from groma._typing import FloatArray, IntArray
 from groma.errors import ShapeError
 
@@ -106,10 +107,9 @@ def inlier_probability(
         common, pooled = 0.5, 2.0
     share, order = np.full(len(band), 0.5), np.argsort(owner, kind="stable")
     sorted_probability, probability = np.zeros(len(distance)), np.zeros(len(distance))
+    first = pointers_of(np.bincount(owner, minlength=len(band)))
     # Some features in advance keep small structures from extremes.
-    _maximise(
-        noise[order], clutter[order], _firsts(owner, len(band)), pooled, common, ROUNDS, share, sorted_probability
-    )
+    _maximise(noise[order], clutter[order], first, pooled, common, ROUNDS, share, sorted_probability)
     probability[order] = sorted_probability
     return probability, share
 
@@ -125,14 +125,9 @@ def maximise_shares(
     density, clutter, probability = density[order], clutter[order], np.zeros(len(density))
     common = np.full(1, 0.5)
     _maximise(density, clutter, np.array([0, len(owner)]), 1.0, 0.5, rounds, common, probability)
-    share = np.full(num, float(common[0]))
-    _maximise(density, clutter, _firsts(owner, num), pooled, float(common[0]), rounds, share, probability)
+    share, first = np.full(num, float(common[0])), pointers_of(np.bincount(owner, minlength=num))
+    _maximise(density, clutter, first, pooled, float(common[0]), rounds, share, probability)
     return share
-
-
-def _firsts(owner: IntArray, num: int) -> IntArray:
-    """Bounds (K + 1,) of the features of each structure."""
-    return np.r_[0, np.cumsum(np.bincount(owner, minlength=num))]
 
 
 def log10_binomial_tail(count: int, number: int, chance: float) -> float:

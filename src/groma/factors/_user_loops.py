@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numba
@@ -174,14 +175,22 @@ def _write_loops(slots: Sequence[Slot], sizes: Sequence[int], residual_size: int
     return "\n".join(lines)
 
 
+@dataclass(eq=False)
 class Loops:
     """The two loops of one user factor, compiled when first needed."""
 
-    def __init__(self, name, function, jacobian, derivative, slots, sizes, residual_size) -> None:
-        self.name, self.function, self.jacobian, self.derivative = name, function, jacobian, derivative
-        self.slots, self.sizes, self.residual_size = slots, sizes, residual_size
-        self._lock = threading.Lock()
-        self._compiled: tuple[Callable, Callable] | None = None
+    name: str
+    #: The user's functions of the residual and, for the derivative ``jacobian``, of its blocks.
+    function: Callable
+    jacobian: Callable | None
+    #: ``central``, ``complex`` or ``jacobian``.
+    derivative: str
+    slots: Sequence[Slot]
+    #: Numbers of each slot's variable that the function gets.
+    sizes: Sequence[int]
+    residual_size: int
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+    _compiled: tuple[Callable, Callable] | None = None
 
     def get(self) -> tuple[Callable, Callable]:
         """Return (residuals_all, linearize_all)."""
@@ -219,8 +228,8 @@ class Loops:
             function.__qualname__ = f"{plain.__qualname__}.{function.__name__}"  # its file is named after it
         return loop(made[0]), loop(made[1])
 
-    def _compile_function(self, function, role: str, signatures) -> Callable:
-        compiled = function if hasattr(function, "py_func") else loop(function)
+    def _compile_function(self, function: Callable, role: str, signatures: Sequence[tuple]) -> Callable:
+        compiled: Any = function if hasattr(function, "py_func") else loop(function)
         if not hasattr(compiled, "compile"):  # NUMBA_DISABLE_JIT=1
             return compiled
         for signature in signatures:

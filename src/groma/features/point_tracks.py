@@ -131,7 +131,7 @@ def follow(
     return there.astype(np.float64) + 0.5, good
 
 
-def _alike(image_1: GrayImage, image_2: GrayImage, first, second, window: int) -> FloatArray:
+def _alike(image_1: GrayImage, image_2: GrayImage, first: np.ndarray, second: np.ndarray, window: int) -> FloatArray:
     """Correlation (N,) of the patches around points (N, 2) of two images, in OpenCV's pixels."""
     reach = np.arange(window, dtype=np.float32) - window // 2
     offset = np.stack(np.meshgrid(reach, reach)).reshape(2, 1, -1)

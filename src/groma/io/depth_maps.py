@@ -169,13 +169,12 @@ def _read_arrays(path: Path, size: tuple[int, int]) -> Array:
     if path.suffix.lower() == ".npy":
         return read_array(path, check)
     with opened_arrays(path) as arrays:
-        name = _ARRAY if _ARRAY in arrays else arrays.names[0] if len(arrays.names) == 1 else None
-        if name is None:
+        if _ARRAY not in arrays and len(arrays.names) != 1:
             raise FileFormatError(
                 f"{path} holds the arrays {', '.join(arrays.names[:5]) or 'none'}; expected one, or one named "
                 f"{_ARRAY!r}."
             )
-        return arrays.read(name, check)
+        return arrays.read(_ARRAY if _ARRAY in arrays else arrays.names[0], check)
 
 
 def _check_size(path: Path, shape: tuple[int, ...], size: tuple[int, int]) -> None:

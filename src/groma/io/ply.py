@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from groma._rows import pointers_of
 from groma._typing import FloatArray, IntArray
 from groma.io.atomic import atomic_output
 from groma.io.drawn import PARTS, Part, drawn
@@ -133,7 +134,7 @@ def write_geometry(scene: Scene, folder: str | os.PathLike[str]) -> tuple[str, .
 def _geometry(scene: Scene, parts: Collection[Part]) -> _Geometry:
     shown = drawn(scene, parts)
     num_points, num_lines = len(shown.points), len(shown.pieces)
-    begin = num_points + 2 * num_lines + np.cumsum([0, *(len(corners) for corners in shown.polygons)])
+    begin = num_points + 2 * num_lines + pointers_of([len(corners) for corners in shown.polygons])
     return _Geometry(
         places=shown.places,
         colours=shown.colours,

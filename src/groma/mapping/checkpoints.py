@@ -89,7 +89,7 @@ class Stage(Generic[_Options, _Result]):
     function: Callable[..., _Result]
 
     def __call__(self, *values: Any) -> _Result:
-        """Do it, without keeping anything."""
+        """Call the function; nothing is kept."""
         return self.function(*values)
 
 

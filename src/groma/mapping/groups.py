@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from groma._rows import pointers_of
 from groma._typing import IntArray
 from groma.problem.sorting import argsort_by
 
@@ -12,7 +13,7 @@ from groma.problem.sorting import argsort_by
 def grouped(owner: IntArray, count: int) -> tuple[IntArray, IntArray]:
     """Rows (N,) sorted by their owner, stably, and pointers (count + 1,) to those of each owner."""
     order = argsort_by(((owner, count),), len(owner))
-    return order, np.concatenate([[0], np.cumsum(np.bincount(owner, minlength=count))])
+    return order, pointers_of(np.bincount(owner, minlength=count))
 
 
 def distinct_pairs(first: IntArray, second: IntArray) -> tuple[IntArray, IntArray]:

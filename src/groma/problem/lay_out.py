@@ -11,13 +11,15 @@ States and losses have no part in it. Where the same problem is solved from othe
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
+from groma._rows import pointers_of
 from groma._typing import IntArray
 from groma.problem._draft import Draft
 from groma.problem._partition import LANDMARK_KINDS, choose_landmarks, couplings, kept_classes
-from groma.problem.layout import CHUNK_SIZE, Chunk, Eliminated, FactorLayout, Incidences, Layout
+from groma.problem.layout import CHUNK_SIZE, Chunk, Eliminated, FactorLayout, Incidences, KeptClass, Layout
 from groma.problem.problem import Problem, under_loss
 from groma.problem.sorting import PairTable, argsort_by, distinct_pairs, first_and_last
 from groma.problem.tied import Divided, with_tied_apart
@@ -114,7 +116,9 @@ def _of_problem(layout: Layout, problem: Problem) -> Layout:
     return dataclasses.replace(layout, problem=problem, factors=factors, of_landmarks=of_landmarks)
 
 
-def _landmark_order(problem, group: str, drafts: list[Draft], kept) -> tuple[IntArray, IntArray]:
+def _landmark_order(
+    problem: Problem, group: str, drafts: list[Draft], kept: Sequence[KeptClass]
+) -> tuple[IntArray, IntArray]:
     """Return the original index at each position, and the position of each index, sorted by the kept blocks seen."""
     count = len(problem.variables[group])
     mine = [draft for draft in drafts if draft.landmark_group == group and draft.entries]
@@ -135,8 +139,14 @@ def _joined(parts: list[IntArray]) -> IntArray:
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
-def _incidences(problem, group, e, order, layouts: list[FactorLayout], kept, tables) -> Eliminated:
-    """Find the landmark-block pairs of one eliminated group and number the pairs of the reduced system they fill."""
+def _incidences(
+    problem: Problem, group: str, e: int, order: IntArray, layouts: list[FactorLayout], kept: Sequence[KeptClass],
+    tables: dict[tuple[int, int], PairTable],
+) -> Eliminated:  # fmt: skip
+    """Find the landmark-block pairs of one eliminated group and number the pairs of the reduced system they fill.
+
+    ``layouts`` get the numbers of these pairs, ``tables`` the pairs of kept blocks that share a landmark.
+    """
     count = len(problem.variables[group])
     incidences: dict[int, Incidences] = {}
     for c, kept_class in enumerate(kept):
@@ -176,19 +186,12 @@ def _incidences(problem, group, e, order, layouts: list[FactorLayout], kept, tab
     return Eliminated(group, problem.variables[group].manifold.dof, count, order, incidences, cross)
 
 
-def _starts(landmark: IntArray, count: int) -> IntArray:
-    """Return the bounds (count + 1,) of the factors of each landmark, for landmarks in ascending order."""
-    starts = np.zeros(count + 1, np.int64)
-    np.cumsum(np.bincount(landmark, minlength=count), out=starts[1:])
-    return starts
-
-
 def _chunks(layouts: list[FactorLayout], eliminated: list[Eliminated], chunk_size: int) -> tuple[Chunk, ...]:
     """Cut the work into chunks of about ``chunk_size`` factors."""
     chunks = []
     for e, group in enumerate(eliminated):
         mine = [f for f, layout in enumerate(layouts) if layout.eliminated == e]
-        starts = [_starts(layouts[f].landmark, group.count) for f in mine]
+        starts = [pointers_of(np.bincount(layouts[f].landmark, minlength=group.count)) for f in mine]
         total = sum(starts, np.zeros(group.count + 1, np.int64))
         begin = 0
         while begin < group.count:

@@ -141,7 +141,8 @@ class NormalEquations:
 
         def work(share: int) -> tuple[list[float], list[int]]:
             sums, hidden = [0.0] * len(self.layout.factors), [0] * len(self.layout.factors)
-            for f, begin, end in self._runs_of_all(share) if wanted is None else self._runs(share, wanted):
+            runs = self._runs_of_all(share) if wanted is None else self._runs(share, wanted)
+            for f, begin, end in runs:
                 e = self.layout.factors[f].eliminated
                 costs = _NO_COSTS if landmark_costs is None or e is None else landmark_costs[e]
                 value, degenerate = self._chunk_cost(f, inputs[f], begin, end, costs)

@@ -14,6 +14,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from groma._rows import pointers_of
 from groma._typing import FloatArray
 from groma.execution import take_in_turn
 from groma.problem.layout import Chunk, Layout
@@ -99,7 +100,7 @@ def shares_of(layout: Layout) -> list[list[Chunk]]:
         kinds.setdefault((chunk.eliminated, *alone), []).append(chunk)
     shares: list[list[Chunk]] = [[] for _ in range(count)]
     for chunks in kinds.values():
-        done = np.concatenate([[0], np.cumsum([max(chunk.size, 1) for chunk in chunks])])
+        done = pointers_of([max(chunk.size, 1) for chunk in chunks])
         cuts = np.searchsorted(done, done[-1] * np.arange(count + 1) / count)
         cuts[0], cuts[-1] = 0, len(chunks)
         for k, share in enumerate(shares):

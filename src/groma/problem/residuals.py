@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from groma._rows import pointers_of
 from groma._typing import FloatArray
 from groma.factors.contract import Factor
 from groma.problem.problem import Problem
@@ -63,7 +64,7 @@ def jacobians_of(factor: Factor, variables: Mapping[str, Variables]) -> dict[str
     """
     references = factor.references()
     groups = [variables[ref.group] for _, ref in references]
-    begin = np.cumsum([0, *(group.manifold.factor_columns for group in groups)])
+    begin = pointers_of([group.manifold.factor_columns for group in groups])
     record = np.zeros((len(factor), factor.residual_size, begin[-1] + 1))
     if len(factor):
         inputs = factor.prepare(tuple(group.ambient() for group in groups))

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from groma._numba import kernel, loop
+from groma._rows import pointers_of
 from groma._typing import IntArray
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
@@ -109,8 +110,7 @@ def distinct_pairs(groups: IntArray, values: IntArray, num_groups: int) -> tuple
     slot = np.cumsum(is_new, dtype=np.int32)
     slot -= 1
     first = np.flatnonzero(is_new)
-    pointer = np.zeros(num_groups + 1, np.int64)
-    np.cumsum(np.bincount(groups[first], minlength=num_groups), out=pointer[1:])
+    pointer = pointers_of(np.bincount(groups[first], minlength=num_groups))
     return slot, pointer, values[first].astype(np.int32)
 
 
@@ -152,8 +152,11 @@ class PairTable:
         """Return (slots, pointer) of all pairs between the rows of two compressed lists."""
         return self._add(pointer_a, column_a, pointer_b, column_b, np.diff(pointer_a) * np.diff(pointer_b), False)
 
-    def _add(self, pointer_a, column_a, pointer_b, column_b, lengths, same: bool) -> tuple[IntArray, IntArray]:
-        pair_pointer = np.concatenate([[0], np.cumsum(lengths)])
+    def _add(
+        self, pointer_a: IntArray, column_a: IntArray, pointer_b: IntArray, column_b: IntArray, lengths: IntArray,
+        same: bool,
+    ) -> tuple[IntArray, IntArray]:  # fmt: skip
+        pair_pointer = pointers_of(lengths)
         slots = np.empty(pair_pointer[-1], np.int32)
         done = 0
         while done < len(lengths):

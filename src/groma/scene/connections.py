@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from groma._rows import connected_parts
+from groma._rows import connected_parts, pointers_of
 from groma._typing import IntArray
 from groma.scene.scene import Scene
 
@@ -22,7 +22,7 @@ def connected_images(scene: Scene) -> list[IntArray]:
     Images that see nothing are groups of their own.
     """
     counts = [len(getattr(scene, name)) for name in _NODES]
-    first = dict(zip(_NODES, np.cumsum([0, *counts]).tolist(), strict=False))
+    first = dict(zip(_NODES, pointers_of(counts).tolist(), strict=False))
     pairs = [np.zeros((0, 2), np.int64)]
     for item in fields(scene):
         table = getattr(scene, item.name)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from groma._rows import pointers_of
 from groma._typing import FloatArray, IntArray
 from groma.scene.scene import Scene
 
@@ -71,7 +72,7 @@ def patch_groups(members: IntArray) -> IntArray:
 
 def triangle_fans(polygons: list[FloatArray]) -> tuple[FloatArray, IntArray]:
     """Return the concatenated corners (n, 3) of convex polygons, and their triangles (t, 3)."""
-    begin = np.cumsum([0, *(len(corners) for corners in polygons)])
+    begin = pointers_of([len(corners) for corners in polygons])
     triangles = [
         first + np.column_stack([np.zeros(len(corners) - 2, int), *(np.arange(len(corners) - 2) + k for k in (1, 2))])
         for first, corners in zip(begin, polygons, strict=False)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from groma._simd import width
+from groma._stopwatch import Stopwatch
 from groma._typing import BoolArray, FloatArray
 from groma.gates import gate
 from groma.problem.layout import Chunk, Layout
@@ -23,7 +24,7 @@ from groma.problem.parallel import Workers
 from groma.solver.damped_problem import Trial
 from groma.solver.linear.schur import MIN_DIAGONAL, invert_blocks
 from groma.solver.options import SolverOptions, first_damping
-from groma.solver.report import SolveReport, Stopwatch, note_costs
+from groma.solver.report import SolveReport, note_costs
 from groma.solver.steps import States
 from groma.solver.termination import Termination
 
@@ -216,10 +217,13 @@ class IndependentBlocks:
                 self._singular[e], self._steepest[e], dof,
             )  # fmt: skip
 
-    def _rescaled(self, states: States, costs, moved: States, new_costs, deltas, promised) -> States:
-        """Return what steps lead to that are tried at another length where their cost fell otherwise than promised.
+    def _rescaled(
+        self, states: States, costs: list[FloatArray], moved: States, new_costs: list[FloatArray],
+        deltas: list[FloatArray], promised: list[FloatArray],
+    ) -> States:  # fmt: skip
+        """Try another length of the steps whose cost fell otherwise than promised; return the better states.
 
-        Those that are better take their place in new costs and steps.
+        ``new_costs`` and ``deltas`` are changed where the other length is better.
 
         A line seen along its length, or anything else that is bent and has large residuals, may bend the cost up: from
         twice the model's curvature on, full steps jump over the minimum to where the cost is higher, for ever. Damping

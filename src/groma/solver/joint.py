@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from groma._stopwatch import Stopwatch
 from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations, to_solver_order
 from groma.problem.parallel import Workers
@@ -16,7 +17,7 @@ from groma.solver.linear.reduction import Reduction
 from groma.solver.linear.schur import ReducedSystem
 from groma.solver.options import SolverOptions, first_damping
 from groma.solver.refinement import landmark_refiner
-from groma.solver.report import SolveReport, Stopwatch, note_costs
+from groma.solver.report import SolveReport, note_costs
 from groma.solver.steps import States, Step, largest_slope, relative_length, retract, sizes_of
 from groma.solver.termination import Termination
 from groma.solver.trial import JointTrial, evaluated

@@ -3,9 +3,6 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from groma._counted import counted
@@ -94,32 +91,6 @@ class SolveReport:
         return "\n".join(
             rows + [f"warning: {text}" for text in self.warnings] + [f"note: {text}" for text in self.notes]
         )
-
-
-class Stopwatch:
-    """Adds the time of named stages to a report."""
-
-    def __init__(self, report: SolveReport) -> None:
-        self._report = report
-        self._start = time.perf_counter()
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        """Time one stage."""
-        begin = time.perf_counter()
-        try:
-            yield
-        finally:
-            self._report.seconds[stage] += time.perf_counter() - begin
-
-    def move(self, source: str, target: str, seconds: float) -> None:
-        """Book time under another stage, for stages that run inside one another."""
-        self._report.seconds[source] -= seconds
-        self._report.seconds[target] += seconds
-
-    def elapsed(self) -> float:
-        """Seconds since the stopwatch was made."""
-        return time.perf_counter() - self._start
 
 
 def count_unknowns(problem: Problem) -> int:

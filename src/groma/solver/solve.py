@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from groma._stopwatch import Stopwatch
 from groma._typing import FloatArray
 from groma.errors import check_kind
 from groma.execution import available_cores
@@ -36,7 +37,7 @@ from groma.solver.independent import STRETCH, IndependentProblem, stretch_factor
 from groma.solver.joint import JointProblem
 from groma.solver.linear.blas import one_blas_thread
 from groma.solver.options import SolverOptions
-from groma.solver.report import Iteration, SolveReport, Stopwatch, count_unknowns, note_costs, warn_of_oddities
+from groma.solver.report import Iteration, SolveReport, count_unknowns, note_costs, warn_of_oddities
 from groma.solver.standing import Standing
 from groma.solver.steps import States
 from groma.solver.termination import Criteria, Termination, is_beyond_cost
@@ -90,7 +91,7 @@ def solve(
     check_kind(problem, Problem, "problem", "Make one: groma.Problem(variables, factors).")
     options = options or SolverOptions()
     report = SolveReport(num_factors=sum(map(len, problem.factors)), num_residuals=problem.num_residuals)
-    watch = Stopwatch(report)
+    watch = Stopwatch(report.seconds)
     with watch("setup"):
         parts, layout = (layouts or Layouts()).of(problem, options.eliminate)
     report.notes += layout.warnings
@@ -101,9 +102,11 @@ def solve(
     report.threads = options.threads or (available_cores() if report.num_factors >= FACTORS_FOR_THREADS else 1)
     workers = Workers(report.threads)
     try:
-        run = _evaluate if options.max_iterations == 0 else _minimised
         with one_blas_thread():
-            states = run(layout, workers, options, report, watch, progress)
+            if options.max_iterations:
+                states = _minimised(layout, workers, options, report, watch, progress)
+            else:
+                states = _evaluate(layout, workers, report, watch)
     finally:
         workers.close()
     warn_of_oddities(report)
@@ -192,9 +195,7 @@ def _improved(problem: DampedProblem[T], trial: T, best: T, share: float) -> tup
     return problem.refine(trial), True
 
 
-def _evaluate(
-    layout: Layout, workers: Workers, options: SolverOptions, report: SolveReport, watch: Stopwatch, progress
-) -> States:
+def _evaluate(layout: Layout, workers: Workers, report: SolveReport, watch: Stopwatch) -> States:
     """Find the costs at the start, and nothing else."""
     with watch("setup"):
         equations, states = NormalEquations(layout, workers), to_solver_order(layout)
@@ -210,8 +211,10 @@ def _evaluate(
 
 
 def _minimised(
-    layout: Layout, workers: Workers, options: SolverOptions, report: SolveReport, watch: Stopwatch, progress
-) -> States:
+    layout: Layout, workers: Workers, options: SolverOptions, report: SolveReport, watch: Stopwatch,
+    progress: Progress | None,
+) -> States:  # fmt: skip
+    """Minimise from the states of the layout's problem."""
     kind: type[Any] = JointProblem if layout.kept else IndependentProblem
     problem = kind(layout, workers, options, watch)
     report.linear_solver = problem.linear_name

@@ -14,6 +14,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from groma._stopwatch import Stopwatch
 from groma.errors import is_interrupt
 from groma.io.trajectories import Trajectory
 from groma.solver.report import SolveReport
@@ -28,7 +29,6 @@ from groma.tracking.frame.rectification import RightTurn
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.outcome import History
 from groma.tracking.result import map_to_scene
-from groma.tracking.stopwatch import Stopwatch
 
 T = TypeVar("T")
 

@@ -12,12 +12,12 @@
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
+from groma._stopwatch import Stopwatch
 from groma._typing import FloatArray
 from groma.errors import InputError
 from groma.execution import work_with
@@ -25,7 +25,7 @@ from groma.geometry import se3
 from groma.io.sequences.frame import Frame, SequenceCamera
 from groma.io.trajectories import Trajectory
 from groma.scene import Scene
-from groma.tracking.backend.behind import Behind
+from groma.tracking.backend.deferred import DeferredTask
 from groma.tracking.backend.mapper import Mapper, Present
 from groma.tracking.backend.submaps import about_submaps
 from groma.tracking.ending import Ending
@@ -50,13 +50,13 @@ from groma.tracking.outcome import (
     TrackedFrame,
     TrackResult,
 )
+from groma.tracking.pose.estimate import PoseEstimate
 from groma.tracking.pose.following import Attempt, find_lines_again, find_points_again, follow_frame, follow_nearby
 from groma.tracking.pose.initialise import Initialiser
 from groma.tracking.pose.prediction import MotionModel
 from groma.tracking.pose.relocalise import Found, promote
 from groma.tracking.pose.verification import PoseVerification, misses_much
 from groma.tracking.result import about_rest, map_to_scene
-from groma.tracking.stopwatch import Stopwatch
 
 
 class Tracker:
@@ -96,7 +96,7 @@ class Tracker:
         #: Times of the losses between the submaps, for the warnings.
         self._breaks: list[tuple[float, float]] = []
         #: Deferred work of the previous frame, and the rotation of the right camera if the assumed one was wrong.
-        self._behind = Behind(self.options.threaded)
+        self._deferred = DeferredTask(self.options.threaded)
         self._better: RightTurn | None = None
         #: Whether the previous frame had to be relocalised.
         self._searched = False
@@ -114,7 +114,7 @@ class Tracker:
             return None
         self._finished = True
         self._settle()
-        self._behind.close()
+        self._deferred.close()
         self._mapper.abandon()
         self._mapper.close()
         return Tracker(self._given, self.options, self._better, self._saved)
@@ -144,17 +144,16 @@ class Tracker:
         """
         if self._finished:
             raise InputError("This track is finished. Make a new Tracker for further frames.")
-        began = time.perf_counter()
         watch = Stopwatch()
         reason = self._checks.reason_to_skip(frame)
         if reason:
-            return self._skip(frame, reason, began)
+            return self._skip(frame, reason, watch)
         present, mapper = self._present, self._mapper
         data = self._ahead.take(frame, mapper.frame_pool, mapper.workers if self._searched else None)
         with watch("map"):
             self._settle()
         if not self.map.keyframes:
-            return self._answer(self._start(data, began, watch))
+            return self._answer(self._start(data, watch))
         attempt, found = self._follow(data, watch), None
         self._searched = attempt.estimate is None
         self._ahead.announce(following, mapper.frame_pool, mapper.workers if self._searched else None)
@@ -162,7 +161,7 @@ class Tracker:
             attempt, found = self._search(data, attempt, watch)
         estimate, followed = attempt.estimate, attempt.followed
         if estimate is None:
-            return self._answer(self._lose(data, attempt.predicted, began, watch))
+            return self._answer(self._lose(data, attempt.predicted, watch))
         pose, status = estimate.pose, FOUND if self._lost_for else TRACKED
         self._motion.update(present.pose if self._lost_for == 0 else None, pose, frame.timestamp)
         if estimate.weak and status == TRACKED:
@@ -176,7 +175,7 @@ class Tracker:
         # A relocalised frame has few tracked features; the next one needs the landmarks of a keyframe.
         at_once = found is not None and mapper.due is None
         is_keyframe = at_once or self._follow_more(data, watch)
-        return self._answer(self._report(frame, status, estimate, is_keyframe, began, watch), at_once)
+        return self._answer(self._report(frame, status, estimate, is_keyframe, watch), at_once)
 
     def _follow_more(self, data: FrameFeatures, watch: Stopwatch) -> bool:
         """Search further points where there are few; choose the frame as a keyframe if needed."""
@@ -197,12 +196,12 @@ class Tracker:
 
     def _answer(self, tracked: TrackedFrame, at_once: bool = False) -> TrackedFrame:
         """Start the deferred work on the map for a frame, optionally with a keyframe of it at once."""
-        self._behind.begin(partial(self._mapper.advance, self._present, at_once))
+        self._deferred.begin(partial(self._mapper.advance, self._present, at_once))
         return tracked
 
     def _settle(self) -> None:
         """Wait for the deferred work of the previous frame."""
-        watch = self._behind.result()
+        watch = self._deferred.result()
         if watch is not None:
             self._history.note_stages(watch.seconds)
             self._better = self._mapper.better_turn
@@ -276,44 +275,41 @@ class Tracker:
 
     # -------------------------------------------------------------------------------------------------- keyframes
 
-    def _start(self, data: FrameFeatures, began: float, watch: Stopwatch) -> TrackedFrame:
+    def _start(self, data: FrameFeatures, watch: Stopwatch) -> TrackedFrame:
         """Make the first keyframes: at once where depth is known, else from the motion between two frames."""
         self._initialiser = self._initialiser or Initialiser(self.camera, self.options)
         with watch("start"):
             poses = self._initialiser.try_start(data)
             if poses is None:
                 status = STARTING if len(self._mapper.maps) == 1 else LOST
-                return self._report(data.frame, status, None, False, began, watch)
+                return self._report(data.frame, status, None, False, watch)
             self._mapper.metric = self._initialiser.metric
             self._present.followed, self._present.pose = self._initialiser.make_map(self.map)
-        self._present.data = data
-        self._initialiser = None
+        self._present.data, self._initialiser = data, None
         if len(self._mapper.maps) > 1:
             self._breaks.append((self._lost_since, data.frame.timestamp))
         self._lost_for = 0
-        if len(self.map.keyframes) > 1:
-            first = self.map.keyframes[0]
+        first = self.map.keyframes[0] if len(self.map.keyframes) > 1 else None
+        if first is not None:
             self._motion.update(None, first.pose, first.timestamp)
-            self._motion.update(first.pose, self._present.pose, data.frame.timestamp)
-        else:
-            self._motion.update(None, self._present.pose, data.frame.timestamp)
+        self._motion.update(None if first is None else first.pose, self._present.pose, data.frame.timestamp)
         self._present.frames_since_keyframe = 0
-        if len(self.map.keyframes) > 1:
+        if first is not None:
             self._mapper.adjust_start(self._present)
         for one in self.map.keyframes[:-1]:
             self._history.entries.append(Entry(one.timestamp, one.index, se3.identity(), self._mapper.current))
-        return self._report(data.frame, TRACKED, None, True, began, watch)
+        return self._report(data.frame, TRACKED, None, True, watch)
 
     # ----------------------------------------------------------------------------------------------------- outcomes
 
-    def _skip(self, frame: Frame, reason: str, began: float) -> TrackedFrame:
+    def _skip(self, frame: Frame, reason: str, watch: Stopwatch) -> TrackedFrame:
         self._history.note(SKIPPED)
         return TrackedFrame(
-            frame.timestamp, None, SKIPPED, {}, {"total": time.perf_counter() - began}, reason=reason,
+            frame.timestamp, None, SKIPPED, {}, {"total": watch.elapsed()}, reason=reason,
             name=frame.name,
         )  # fmt: skip
 
-    def _lose(self, data: FrameFeatures, guess: FloatArray, began: float, watch: Stopwatch) -> TrackedFrame:
+    def _lose(self, data: FrameFeatures, guess: FloatArray, watch: Stopwatch) -> TrackedFrame:
         now = data.frame.timestamp
         if self._lost_for == 0 or math.isnan(self._lost_since):
             self._lost_since = now
@@ -325,15 +321,18 @@ class Tracker:
         if long and not stays:
             self._mapper.begin_anew(self._present)
             self._present, self._motion = Present(), MotionModel(self.options.gates.motion)
-            return self._start(data, began, watch)
-        return self._report(data.frame, LOST, None, False, began, watch)
+            return self._start(data, watch)
+        return self._report(data.frame, LOST, None, False, watch)
 
-    def _report(self, frame, status, estimate, is_keyframe, began, watch) -> TrackedFrame:
+    def _report(
+        self, frame: Frame, status: str, estimate: PoseEstimate | None, is_keyframe: bool, watch: Stopwatch
+    ) -> TrackedFrame:
+        """Note a frame with its pose, if the status has one, and return what became of it."""
         self.status = status
         has_pose = status in (TRACKED, FOUND, WEAK)
         if has_pose:
             self._history.note_pose(self.map, frame.timestamp, self._present.pose, self._mapper.current)
-        timings = {**watch.seconds, "total": time.perf_counter() - began}
+        timings = {**watch.seconds, "total": watch.elapsed()}
         self._history.note(status, timings)
         return TrackedFrame(
             frame.timestamp, self._present.pose.copy() if has_pose else None, status,
@@ -359,9 +358,9 @@ class Tracker:
         """
         self._finished, mapper, history = True, self._mapper, self._history
         ending = Ending(mapper, history)
-        self._behind.stand_still()
+        self._deferred.stand_still()
         ending.attempt("what followed the last frame", self._settle, None)
-        self._behind.close()
+        self._deferred.close()
         ending.settle(self._present)
         where = ending.join()
         roots = sorted({root for root, _ in where if mapper.maps[root].keyframes}) or [0]

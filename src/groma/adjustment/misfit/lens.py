@@ -113,7 +113,7 @@ def unmodelled_distortion(
     groups = {
         name: camera_model(wider[model.name])
         for name, model in groups.items()
-        if model.name in wider and _may_lack(problem.variables[name], model, wider[model.name])
+        if model.name in wider and (wider[model.name] != model.name or problem.variables[name].is_constant)
     }
     seen = [f for f in problem.factors if isinstance(f, PointReprojection) and f.intrinsics.group in groups]
     residuals = residuals or Residuals(problem)
@@ -167,11 +167,6 @@ def _rings(camera: IntArray, radius: FloatArray, cameras: int, rings: int) -> In
     np.maximum.at(largest, camera, radius)
     share = radius / np.maximum(largest, 1e-12).take(camera)
     return camera.astype(np.int64) * rings + np.minimum((share * share * rings).astype(np.int64), rings - 1)
-
-
-def _may_lack(group: Variables, model: CameraModel, wider: str) -> bool:
-    """Whether a wider model would free something that is not free already."""
-    return wider != model.name or group.is_constant
 
 
 def of_points(problem: Problem, most: int) -> Problem:

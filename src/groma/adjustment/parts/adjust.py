@@ -22,18 +22,18 @@ import numpy as np
 from groma.adjustment.adjust import COUNTED_OTHERWISE
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.parts.checkpoint import FOLDER, Checkpoint, key_of
+from groma.adjustment.parts.communication import agreed
 from groma.adjustment.parts.cut import parts_of
 from groma.adjustment.parts.memory import room_for_parts
 from groma.adjustment.parts.opened import open_parts
 from groma.adjustment.parts.run import Run, Solved, Squares, Written
-from groma.adjustment.parts.together import agreed
 from groma.adjustment.report import AdjustReport, not_converged
 from groma.errors import InputError, OutputError
 from groma.factors.losses import Loss, Trivial
 from groma.solver.linear.blas import one_blas_thread
 from groma.solver.options import SolverOptions
-from groma.solver.reduce.alone import Alone
 from groma.solver.reduce.contract import Reducer
+from groma.solver.reduce.single import SingleProcess
 from groma.solver.report import SolveReport
 from groma.solver.solve import Progress
 
@@ -99,7 +99,7 @@ def adjust_parts(
     OutputError
         If archives exist in ``output`` already, or cannot be written.
     """
-    reducer, options = reducer or Alone(), options or SolverOptions()
+    reducer, options = reducer or SingleProcess(), options or SolverOptions()
     chosen = AssemblyOptions(**assembly)  # type: ignore[arg-type]
     paths = [Path(part) for part in parts]
     with agreed(reducer):
@@ -161,6 +161,7 @@ def _tidy(output: Path, paths: Sequence[Path], checkpoint: Checkpoint) -> None:
 def _result(run: Run, output: Path, solved: Solved, written: Written) -> PartsResult:
     """Say what an adjustment did."""
     opened, before, after = run.opened, [fact["squares"] for fact in run.opened.facts], written.squares
+    kinds = sorted({kind for part in before for kind in part}, reverse=True)
     measurements: dict[str, int] = {}
     for fact in opened.facts:
         for name, count in fact["measurements"].items():
@@ -173,7 +174,7 @@ def _result(run: Run, output: Path, solved: Solved, written: Written) -> PartsRe
         num_lines=opened.total("lines"),
         num_planes=opened.num_planes,
         num_observations=opened.total("observations"),
-        rmse_px={kind: {"before": _rms(before, kind), "after": _rms(after, kind)} for kind in _kinds(before)},
+        rmse_px={kind: {"before": _rms(before, kind), "after": _rms(after, kind)} for kind in kinds},
         inliers={},
         sigma0=None,
         solve=solved.report,
@@ -183,10 +184,6 @@ def _result(run: Run, output: Path, solved: Solved, written: Written) -> PartsRe
         num_measurements=measurements,
     )
     return PartsResult(tuple(output / path.name for path in opened.paths), solved.report, warnings, adjustment)
-
-
-def _kinds(squares: Squares) -> list[str]:
-    return sorted({kind for part in squares for kind in part}, reverse=True)
 
 
 def _rms(squares: Squares, kind: str) -> float:

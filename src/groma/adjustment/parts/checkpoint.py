@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray
+from groma.adjustment.parts.communication import agreed
 from groma.adjustment.parts.opened import LANDMARKS, OpenParts
-from groma.adjustment.parts.together import agreed
 from groma.bounded.arrays import opened_arrays
 from groma.errors import FileFormatError
 from groma.io.atomic import atomic_output

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from groma._typing import IntArray
-from groma.adjustment.parts.same import check_same_scene
+from groma.adjustment.parts.same_scene import check_same_scene
 from groma.adjustment.terms.relations import ANGLES
 from groma.errors import InputError, OutputError
 from groma.io.archive import read_archive, write_archive

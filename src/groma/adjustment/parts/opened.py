@@ -28,8 +28,8 @@ from groma.adjustment.assemble import (
     structure_variables,
 )
 from groma.adjustment.assembly_options import AssemblyOptions
-from groma.adjustment.parts.same import check_same_scene
-from groma.adjustment.parts.together import agreed, exchange
+from groma.adjustment.parts.communication import agreed, exchange
+from groma.adjustment.parts.same_scene import check_same_scene
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.adjustment.stages import with_loss
 from groma.adjustment.survey.place import moved_to, placement

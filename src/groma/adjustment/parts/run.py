@@ -12,8 +12,8 @@ import numpy as np
 from groma.adjustment.adjust import damping_after, stage_tolerance
 from groma.adjustment.assemble import disassemble
 from groma.adjustment.parts.checkpoint import Checkpoint, Progressed, reports_of
+from groma.adjustment.parts.communication import agreed, exchange
 from groma.adjustment.parts.opened import LANDMARKS, OpenParts
-from groma.adjustment.parts.together import agreed, exchange
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.adjustment.relation_outcome import drop_failed_relations
 from groma.adjustment.rescue.restart import renew_lines, with_seen_ends
@@ -187,7 +187,7 @@ class Run:
                     assert last is not None
                     found = last.scale, last.rotation.tolist(), last.translation.tolist()
         told = next((one for one in exchange(self.reducer, found) if one), None)
-        return told and Similarity(told[0], np.array(told[1]), np.array(told[2]))
+        return None if told is None else Similarity(told[0], np.array(told[1]), np.array(told[2]))
 
     def write(self, solved: Solved, output: Path) -> Written:
         """Write the parts of this process; return squared residuals and relations of all parts."""

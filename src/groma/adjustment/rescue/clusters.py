@@ -9,7 +9,7 @@ and planes held, clusters are independent; all suspicious ones form one small pr
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -103,7 +103,9 @@ def _label_of(factor: Factor, cluster: dict[str, IntArray]) -> IntArray:
     return np.where(np.all(np.equal(labels, labels[0]), axis=0), labels[0], -1)
 
 
-def _ill_fitting(factors, labels: list[IntArray], count: int, variables: Mapping[str, Variables]) -> BoolArray:
+def _ill_fitting(
+    factors: Sequence[Factor], labels: list[IntArray], count: int, variables: Mapping[str, Variables]
+) -> BoolArray:
     """Return which clusters cost far more per observation than usual, (count + 1,); the last stands for no cluster."""
     cost, views = np.zeros(count + 1), np.zeros(count + 1)
     for factor, label in zip(factors, labels, strict=True):

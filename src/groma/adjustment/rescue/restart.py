@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from groma._rows import pointers_of
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assemble import disassemble
 from groma.adjustment.terms.lines import LINE_FACTORS
@@ -69,8 +70,11 @@ def renew_lines(scene: Scene, problem: Problem, threads: int | None = None) -> t
         Threads; None takes one for small problems and all cores for large ones.
     """
     lines = problem.variables.get("lines")
-    factors = [factor for factor in problem.factors if len(factor) and _slot_of_lines(factor)]
-    factors = [factor for factor in factors if not _is_between_lines(factor)]
+    factors = [
+        factor
+        for factor in problem.factors
+        if len(factor) and [ref.group for _, ref in factor.references()].count("lines") == 1
+    ]
     if lines is None or lines.is_constant or not factors:
         return problem, np.zeros(0, np.int64)
     chosen, second = _second_starts(scene, problem, factors)
@@ -97,16 +101,12 @@ def went_elsewhere(segments: FloatArray, before: FloatArray, after: FloatArray) 
     return np.asarray(~(away <= GATES.elsewhere * np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)))
 
 
-def _slot_of_lines(factor: Factor) -> str | None:
-    return next((slot.name for slot, ref in factor.references() if ref.group == "lines"), None)
-
-
-def _is_between_lines(factor: Factor) -> bool:
-    return sum(ref.group == "lines" for _, ref in factor.references()) > 1
+def _slot_of_lines(factor: Factor) -> str:
+    return next(slot.name for slot, ref in factor.references() if ref.group == "lines")
 
 
 def _line_of(factor: Factor) -> IntArray:
-    return getattr(factor, _slot_of_lines(factor) or "").index
+    return getattr(factor, _slot_of_lines(factor)).index
 
 
 def _with_second(factor: Factor, chosen: IntArray, count: int) -> Factor:
@@ -119,7 +119,7 @@ def _with_second(factor: Factor, chosen: IntArray, count: int) -> Factor:
     again = np.flatnonzero(number[line] >= 0)
     both = factor.take(np.concatenate([np.arange(len(factor)), again]))
     index = Ref("lines", np.concatenate([line, number[line[again]]]))
-    return replace(both, **{_slot_of_lines(factor) or "": index})
+    return replace(both, **{_slot_of_lines(factor): index})
 
 
 def _joined(lines: Variables, chosen: IntArray, second: FloatArray) -> Variables:
@@ -172,7 +172,7 @@ def triangulated_anew(scene: Scene, lines: IntArray) -> tuple[FloatArray, BoolAr
     planes = np.concatenate([normal, -np.einsum("ni,ni->n", normal, center)[:, None]], axis=1)
     usable: BoolArray = np.asarray(np.isfinite(planes).all(axis=1))
     weight = np.where(usable, np.linalg.norm(np.where(usable[:, None], normal, 0.0), axis=1), 0.0)
-    pointers = np.concatenate([[0], np.cumsum(np.bincount(table.line_idx[rows], minlength=scene.num_lines)[lines])])
+    pointers = pointers_of(np.bincount(table.line_idx[rows], minlength=scene.num_lines)[lines])
     result = triangulate_planes(planes, pointers, center, weight)
     found: BoolArray = np.asarray(line3.is_finite(result.line) & (np.abs(result.line) > 0).any(axis=1))
     return result.line, found

@@ -100,7 +100,9 @@ def _needed(scene: Scene, rejected: set[tuple[str, int]], doubted: set[tuple[str
 
     parts = [{place for place in doubted if place[0] == table} for table in {table for table, _ in doubted}]
     needed = [part for part in parts if opens(part)]
-    return set().union(*needed) if needed else doubted if opens(doubted) else set()
+    if not needed and opens(doubted):
+        return doubted
+    return set().union(*needed)
 
 
 def _second_last(scene: Scene, rejected: set[tuple[str, int]]) -> set[tuple[str, int]]:

@@ -33,7 +33,9 @@ class Console:
 
     def say(self, *texts: str) -> None:
         """Print sentences unless --quiet, wrapped on a terminal."""
-        for text in texts if not self.quiet else ():
+        if self.quiet:
+            return
+        for text in texts:
             text = wrapped(text, terminal_width()) if is_terminal(self._stream) else text
             print(text, file=self._stream, flush=True)
 

@@ -60,7 +60,7 @@ def adjust_parts_and_write(
     force : bool
         Replace existing files.
     """
-    from groma.adjustment.parts.together import agreed
+    from groma.adjustment.parts.communication import agreed
 
     with _one_voice() as reducer:
         with agreed(reducer):
@@ -77,8 +77,8 @@ def _adjust(
 ) -> dict[str, Any]:
     """Adjust, and return the numbers."""
     from groma.adjustment.parts import adjust_parts, parts_of
+    from groma.adjustment.parts.communication import agreed
     from groma.adjustment.parts.settings import settings_of
-    from groma.adjustment.parts.together import agreed
     from groma.adjustment.report import Progress
     from groma.cli.shared.sentences import say_adjustment
     from groma.compilation.time import compilation_time
@@ -141,7 +141,7 @@ def _checked(source: Path, output: Path | None, refused: dict[str, Any]) -> Path
 @contextmanager
 def _one_voice() -> Iterator[Reducer]:
     """Yield the reducer of this process. An error is printed once and ends all ranks."""
-    from groma.adjustment.parts.together import ToldByAllError
+    from groma.adjustment.parts.communication import AllRanksError
     from groma.solver.reduce.mpi import Ranks, reducer_of_launcher, started_as
 
     try:
@@ -152,7 +152,7 @@ def _one_voice() -> Iterator[Reducer]:
         raise typer.Exit(1) from None  # rank 0 prints it
     try:
         yield reducer
-    except ToldByAllError:
+    except AllRanksError:
         if reducer.rank == 0:
             raise
         raise typer.Exit(1) from None

@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.linalg import eigh
 
-from groma._typing import BoolArray, FloatArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError, check_kind
 from groma.estimators.motion.degeneracy import what_is_common, why_open
 from groma.estimators.motion.groups import FREEDOM, Kind, changed_frame, moved, tangent_between
@@ -191,8 +191,8 @@ class _Search:
         parts = np.array_split(motions, max(1, len(motions) // 256))
         return np.concatenate([np.minimum(prepared.costs(part), limit).sum(axis=-1) for part in parts])
 
-    def _share(self, motions: FloatArray, some) -> float:
-        """Share of the matches that agrees with proposals that are mostly wrong, those of their samples included."""
+    def _share(self, motions: FloatArray, some: IntArray) -> float:
+        """Share of some matches that agrees with proposals that are mostly wrong, those of their samples included."""
         prepared = Prepared.of(self.prepared.matches.take(some))
         chosen = motions[:: max(1, len(motions) // 200)]
         agree = (prepared.costs(chosen) <= self.limit[some]).sum(axis=-1)

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._numba import loop
+from groma._rows import pointers_of
 from groma._typing import FloatArray, IntArray
 from groma.errors import ShapeError
 from groma.features.segments import Segments
@@ -28,7 +29,7 @@ class NearbyPoints:
     def common_with(self, other: NearbyPoints) -> NearbyPoints:
         """Without the points that are near no segment of the other image: not seen there, or far from all lines."""
         keep = np.isin(self.point_id, other.point_id)
-        begin = np.concatenate([[0], np.cumsum(keep)])[self.begin]
+        begin = pointers_of(keep)[self.begin]
         return NearbyPoints(begin, self.point_id[keep], self.distance[keep])
 
 

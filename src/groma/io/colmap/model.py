@@ -130,7 +130,10 @@ def _scene_of(
     seen: Mapping[int, np.ndarray] | None = None,
     in_space: np.ndarray | None = None,
 ) -> Scene:
-    """Do it; ``seen`` are the 2D points of each image and ``in_space`` the points, where they are known otherwise."""
+    """Return the scene of a reconstruction whose points may have been read from the files, not by pycolmap.
+
+    ``seen`` are the 2D points of each image by its identifier, and ``in_space`` the 3D points.
+    """
     cameras = _cameras(reconstruction)
     camera_row = _rows(cameras.ids)
     rigs = Rigs(np.array(sorted(reconstruction.rigs), np.int64))

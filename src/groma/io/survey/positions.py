@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -125,8 +125,9 @@ def _with_header(place: Path, rows: Sequence[tuple[int, list[str]]], columns: di
 
 
 def _places(
-    place: Path, rows: Sequence[tuple[int, list[str]]], names: list[str], system: CoordinateSystem, tail
-) -> Places:
+    place: Path, rows: Sequence[tuple[int, list[str]]], names: list[str], system: CoordinateSystem,
+    tail: Callable[[list[float], str], list[float]],
+) -> Places:  # fmt: skip
     """Return places of rows of a name, three coordinates, and what ``tail`` turns into three standard deviations."""
     found: dict[str, list[float]] = {}
     without_height = 0
@@ -162,4 +163,6 @@ def _after_z(rest: list[float], where: str) -> list[float]:
         return [rest[3], rest[3], rest[4]]
     if len(rest) in (0, 3):
         return [0.0] * 3
-    return [rest[0]] * 3 if len(rest) == 1 else [rest[0], rest[0], rest[1]] if len(rest) == 2 else [rest[3]] * 3
+    if len(rest) == 2:
+        return [rest[0], rest[0], rest[1]]
+    return [rest[0] if len(rest) == 1 else rest[3]] * 3

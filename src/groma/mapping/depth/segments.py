@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from groma import cameras as camera_models
+from groma._rows import pointers_of
 from groma._typing import FloatArray, IntArray
 from groma.execution import map_work
 from groma.features.depth.lines import DepthLineGates, fit_depth_lines
@@ -77,7 +78,7 @@ def with_line_depths(scene: Scene, line_map: LineMap, segments: Sequence[Segment
     """Return a scene whose lines are those of a map, with the depths (S, 5) of the segments that see them."""
     if depths is None:
         return scene
-    first = np.cumsum([0, *(len(one) for one in segments)])
+    first = pointers_of([len(one) for one in segments])
     of = depths[first[line_map.image_idx] + line_map.segment_idx]
     rows = np.flatnonzero(of[:, 0] > 0.0)
     if len(rows) == 0:

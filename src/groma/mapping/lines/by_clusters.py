@@ -25,6 +25,7 @@ from typing import TypeVar, overload
 
 import numpy as np
 
+from groma._rows import pointers_of
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_work
 from groma.features.segments import Segments
@@ -60,7 +61,7 @@ def map_lines_by_clusters(
 
     ``neighbors`` are those of each image; ``options.cluster_size`` says how many images a cluster has at most.
     """
-    pointers = np.concatenate([[0], np.cumsum([len(one) for one in segments])]).astype(np.int64)
+    pointers = pointers_of([len(one) for one in segments])
     count = -(-scene.num_images // options.cluster_size)
     whole = _Whole(scene, segments, neighbors, options)
     without_points = replace(whole, scene=scene.keep(points=[]))  # places are all that they tell

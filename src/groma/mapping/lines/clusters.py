@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from groma._rows import pointers_of
 from groma._typing import IntArray
 from groma.mapping.lines.views import LineViews
 
@@ -40,7 +41,7 @@ class Cluster:
             if item.name != "pointers"
         }
         columns["image_idx"] = self.image(columns["image_idx"])
-        return LineViews(**columns, pointers=np.concatenate([[0], np.cumsum(np.diff(views.pointers)[self.known])]))
+        return LineViews(**columns, pointers=pointers_of(np.diff(views.pointers)[self.known]))
 
     def image(self, images: IntArray) -> IntArray:
         """Return the numbers that images of the cluster and its ring have in it."""

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from groma import cameras as camera_models
+from groma._rows import pointers_of
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
 from groma.features.segments import Segments
@@ -98,7 +99,7 @@ class _Split:
 
     def joined(self, found: LineMap, counts: Sequence[int], min_images: int) -> LineMap:
         """Return the map in terms of the images, of lines that enough of them see."""
-        first = np.cumsum([0, *counts])
+        first = pointers_of(counts)
         row_of = np.concatenate([
             np.zeros(0, np.int64), *(first[i] + rows for i, rows in zip(self.image, self.rows, strict=True))
         ])  # fmt: skip

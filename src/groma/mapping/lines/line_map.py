@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._counted import counted
+from groma._rows import pointers_of
 from groma._typing import FloatArray, IntArray
 from groma.features.segments import Segments
 from groma.mapping.lines.intervals import with_supported_intervals
@@ -65,7 +66,7 @@ class LineMap:
 
     def add_to(self, scene: Scene, segments: Sequence[Segments]) -> Scene:
         """Return the scene with these lines and their observations in place of its own lines."""
-        first = np.cumsum([0, *(len(one) for one in segments)])[self.image_idx] + self.segment_idx
+        first = pointers_of([len(one) for one in segments])[self.image_idx] + self.segment_idx
         seen = Segments.joined(segments).select(first)
         usual = float(np.median(seen.sigma)) if len(seen) else 1.0
         lines = scene.keep(lines=[]).replace(

@@ -15,6 +15,7 @@ from functools import partial
 import numpy as np
 
 from groma import cameras as camera_models
+from groma._rows import pointers_of
 from groma._trees import kd_tree, nearest
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_in_threads, map_work
@@ -114,7 +115,7 @@ def build_views(
     return LineViews(
         camera=camera,
         center=scene.cam_centers_in_world,
-        pointers=np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
+        pointers=pointers_of(sizes),
         image_idx=np.repeat(np.arange(count), sizes),
         line=segment2.to_line(columns["ends"]),
         **columns,
@@ -125,7 +126,7 @@ def views_of_rows(
     scene: Scene, segments: Sequence[Segments], rows: IntArray, min_length: float, noise: float
 ) -> LineViews:
     """Return the table of some segments, ascending ``rows`` among all, without where to look for them in depth."""
-    first = np.concatenate([[0], np.cumsum([len(one) for one in segments])])
+    first = pointers_of([len(one) for one in segments])
     bounds = np.searchsorted(rows, first)
     chosen = [one.select(rows[bounds[i] : bounds[i + 1]] - first[i]) for i, one in enumerate(segments)]
     undistorted = map_in_threads(lambda i: _undistorted(scene, i, chosen[i], min_length), range(scene.num_images))

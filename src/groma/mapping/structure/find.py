@@ -39,6 +39,7 @@ from groma.mapping.structure.relations import Landmarks, Pairs, on_lines, spacin
 from groma.mapping.structure.rough_planes import on_fitted_planes
 from groma.scene import Directions, Held, Planes, Relations, Scene
 from groma.scene.survey import Kind
+from groma.scene.table import new_index_of
 
 #: Of points, and of lines.
 LandmarkNoise = tuple[PointNoise, LineNoise]
@@ -290,13 +291,14 @@ def _landmarks(scene: Scene, options: StructureOptions, noise: LandmarkNoise | N
 
 def _only(planes: PlaneSet, kept: BoolArray) -> tuple[PlaneSet, IntArray]:
     """Return some of the planes, and the new number of each old one, -1 where it is gone."""
-    new = np.where(kept, np.cumsum(kept) - 1, -1)
-    return planes.take(np.flatnonzero(kept), new), new
+    rows = np.flatnonzero(kept)
+    new = new_index_of(rows, len(kept))
+    return planes.take(rows, new), new
 
 
 def _only_directions(directions: DirectionSet, kept: BoolArray) -> tuple[DirectionSet, IntArray]:
     """Return some of the directions, and the new number of each old one, -1 where it is gone."""
-    new = np.where(kept, np.cumsum(kept) - 1, -1)
+    new = new_index_of(np.flatnonzero(kept), len(kept))
     right = new[directions.orthogonal]
     chosen = DirectionSet(
         directions.vectors[kept],

@@ -110,7 +110,7 @@ def _joined(
         group = _beside(marks, planes, points, lines, k, free)
         if not rough[group].any() and not _contradict(planes, group, level):
             continue
-        whole, group = _whole(marks, planes, points, lines, group, rough[group].max(), fitted, level)
+        whole, group = _whole(marks, planes, points, lines, group, rough[group].max(), fitted)
         if len(group) > 1:
             groups.append(group)
             wholes.append(whole)
@@ -152,7 +152,6 @@ def _whole(
     group: list[int],
     rough: float,
     fitted: Callable[[PlaneSet], _Told],
-    level: float,
 ) -> tuple[PlaneSet, list[int]]:
     """One plane for those of a group that are pieces of it, and which these are: the first alone if there are none.
 

@@ -88,7 +88,10 @@ def angle_line_plane(covariances: Covariances, line: Variable, plane: Variable) 
     return Quantity(np.pi / 2 - off.value, off.sigma)
 
 
-def _angle(covariances: Covariances, first: Variable, second: Variable, kinds, a: slice, b: slice) -> Quantity:
+def _angle(
+    covariances: Covariances, first: Variable, second: Variable, kinds: tuple[str, str], a: slice, b: slice
+) -> Quantity:
+    """Angle between the directions at ``a`` and ``b`` of what factors read of the two variables."""
     _check(covariances, (first, second), kinds)
     ambients = [
         covariances.problem.variables[g].manifold.ambient(covariances.problem.variables[g].state[i : i + 1])[0]
@@ -117,7 +120,10 @@ def _angle(covariances: Covariances, first: Variable, second: Variable, kinds, a
     return Quantity(value, sigma / cosine)
 
 
-def _norm(covariances: Covariances, first: Variable, second: Variable, kinds, function: Callable) -> Quantity:
+def _norm(
+    covariances: Covariances, first: Variable, second: Variable, kinds: tuple[str, str], function: Callable
+) -> Quantity:
+    """Length of the vector that a function makes of two variables."""
     _check(covariances, (first, second), kinds)
     derived = covariances.derived(function, (first, second))
     return Quantity(float(np.linalg.norm(derived.value)), _length_sigma(derived.value, derived.covariance))

@@ -27,7 +27,7 @@ from groma.solver.covariance.s_transform import Transformation
 
 
 def released(covariances: Covariances, held: Factor) -> Covariances:
-    """Return covariances in which a combination is as uncertain as other factors leave it.
+    """Return covariances as if a factor that holds one combination of variables were absent.
 
     Parameters
     ----------

@@ -18,6 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from groma._numba import kernel, loop
+from groma._rows import pointers_of
 from groma._simd import add_matvec, add_product, set_product, width
 from groma._typing import FloatArray, IntArray
 from groma.problem.layout import Layout
@@ -169,7 +170,7 @@ class BlockCholesky:
         a, b = position[blocks_row[off]], position[blocks_column[off]]
         row, column = np.maximum(a, b), np.minimum(a, b)
         order = argsort_by(((row, count), (column, count)), len(off))
-        self._pointer = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=count))])
+        self._pointer = pointers_of(np.bincount(row, minlength=count))
         self._column = column[order].astype(np.int32)
         self._slot = off[order].astype(np.int32)
         #: Whether a block of S stands transposed above the diagonal of the ordered matrix.
@@ -181,7 +182,7 @@ class BlockCholesky:
         below = np.zeros(count, np.int64)
         #: Products of two blocks that a factorisation takes.
         self.num_products = int(_count(self._pointer, self._column, self._parent, below))
-        self._first = np.concatenate([[0], np.cumsum(below)])
+        self._first = pointers_of(below)
         self._rows = np.empty(self._first[-1], np.int32)
         self._M: FloatArray = np.empty(0)
         self._D: FloatArray = np.empty(0)

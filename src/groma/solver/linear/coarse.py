@@ -22,13 +22,14 @@ from collections.abc import Mapping
 import numpy as np
 
 from groma._numba import loop
+from groma._rows import pointers_of
 from groma._simd import add_matvec, add_product, set_product, width
 from groma._typing import FloatArray, IntArray
 from groma.problem.gauge import gauge_directions
 from groma.problem.layout import Layout
 from groma.problem.sorting import argsort_by
-from groma.solver.linear.elsewhere import Elsewhere
 from groma.solver.linear.lapack import potrf, potrs
+from groma.solver.linear.remote_blocks import RemoteBlocks
 
 #: Cameras in a cluster, unless that makes more clusters than MAX_CLUSTERS (cost: of the coarse system; the solution is
 #: the same).
@@ -121,12 +122,12 @@ _ONE, _MODES = width(1), width(7)
 class CoarseSpace:
     """Clusters of the cameras of one layout, and how they move; ``kept_class`` is that of the cameras."""
 
-    def __init__(self, layout: Layout, kept_class: int, elsewhere: Elsewhere | None = None) -> None:
-        self._layout, self.kept_class, self._elsewhere = layout, kept_class, elsewhere
+    def __init__(self, layout: Layout, kept_class: int, remote: RemoteBlocks | None = None) -> None:
+        self._layout, self.kept_class, self._remote = layout, kept_class, remote
         self._kept = layout.kept[kept_class]
         rows, columns = layout.blocks[kept_class, kept_class]
-        if elsewhere is not None:
-            rows, columns = map(np.concatenate, zip((rows, columns), elsewhere.pairs(kept_class), strict=True))
+        if remote is not None:
+            rows, columns = map(np.concatenate, zip((rows, columns), remote.pairs(kept_class), strict=True))
         self._cluster = _clusters(rows, columns, self._kept.count)
         self.count = int(self._cluster.max()) + 1
         self._state: FloatArray | None = None
@@ -151,8 +152,8 @@ class CoarseSpace:
         rows, columns = self._layout.blocks[self.kept_class, self.kept_class]
         n = self.count
         A = coarse_products(S, rows, columns, self._cluster, self._P)
-        if self._elsewhere is not None:
-            A += self._elsewhere.coarse(self.kept_class, self._cluster, self._P)
+        if self._remote is not None:
+            A += self._remote.coarse(self.kept_class, self._cluster, self._P)
         A = A.reshape(n, n, 7, 7).transpose(0, 2, 1, 3).reshape(7 * n, 7 * n)
         A = A + A.T
         diagonal = A.diagonal()
@@ -190,7 +191,7 @@ def coarse_products(S: FloatArray, rows: IntArray, columns: IntArray, cluster: I
     return A
 
 
-def coarse_space(layout: Layout, elsewhere: Elsewhere | None = None) -> CoarseSpace | None:
+def coarse_space(layout: Layout, remote: RemoteBlocks | None = None) -> CoarseSpace | None:
     """Return the coarse space of the largest class of cameras; None where there are too few."""
     variables = layout.problem.variables
     cameras = [
@@ -200,7 +201,7 @@ def coarse_space(layout: Layout, elsewhere: Elsewhere | None = None) -> CoarseSp
     ]
     if not cameras or max(cameras)[0] < MIN_CLUSTERS * CLUSTER_SIZE:
         return None
-    return CoarseSpace(layout, max(cameras)[1], elsewhere)
+    return CoarseSpace(layout, max(cameras)[1], remote)
 
 
 def _clusters(rows: IntArray, columns: IntArray, count: int) -> IntArray:
@@ -208,7 +209,7 @@ def _clusters(rows: IntArray, columns: IntArray, count: int) -> IntArray:
     ends = np.concatenate([rows, columns])
     order = argsort_by(((ends, count),), len(ends))
     neighbor = np.concatenate([columns, rows])[order]
-    pointer = np.concatenate([[0], np.cumsum(np.bincount(ends, minlength=count))])
+    pointer = pointers_of(np.bincount(ends, minlength=count))
     cluster = np.full(count, -1, np.int32)
     _grow(pointer, neighbor, max(CLUSTER_SIZE, -(-count // MAX_CLUSTERS)), cluster)
     return cluster

@@ -30,6 +30,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from groma._rows import pointers_of
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.problem.layout import Layout
 from groma.solver.linear.blocks import Blocks
@@ -80,7 +81,7 @@ class Fronts:
 
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
-        first = np.concatenate([[0], np.cumsum([c.count for c in layout.kept])])
+        first = pointers_of([c.count for c in layout.kept])
         self._widths = np.concatenate([np.full(c.count, c.width, np.int64) for c in layout.kept])
         self._starts = np.concatenate([c.start + c.width * np.arange(c.count, dtype=np.int64) for c in layout.kept])
         pairs = {
@@ -106,7 +107,7 @@ class Fronts:
         local = np.cumsum(widths) - widths
         local -= local[starts][owner]
         size = np.bincount(owner[eliminated], weights=widths[eliminated], minlength=len(fronts)).astype(np.int64)
-        first = np.concatenate([[0], np.cumsum(np.bincount(owner, weights=widths).astype(np.int64))])
+        first = pointers_of(np.bincount(owner, weights=widths).astype(np.int64))
         by_key = np.argsort(owner * count + blocks)
         keys = (owner * count + blocks)[by_key]
 
@@ -134,7 +135,7 @@ class Fronts:
             fronts[f].children = int(number)
         self._inner = np.flatnonzero(~is_leaf).tolist()
         pointers, places, shapes = self._sorted_into_fronts(pairs, position, home, place, is_leaf)
-        at = np.concatenate([[0], np.cumsum(np.where(is_leaf, np.diff(first) * size, 0))])
+        at = pointers_of(np.where(is_leaf, np.diff(first) * size, 0))
         self._leaves = Leaves(order, size, first, at, unknowns, in_parent, pointers, places, shapes, np.empty(at[-1]))
 
     def _sorted_into_fronts(

@@ -19,7 +19,7 @@ from groma.problem.layout import Layout
 from groma.solver.linear.blocks import Blocks, add_block_products, products, split
 from groma.solver.linear.coarse import CoarseSpace, coarse_space
 from groma.solver.linear.contract import is_pose_graph, keeps_poses_alone, register_linear_solver
-from groma.solver.linear.elsewhere import Elsewhere
+from groma.solver.linear.remote_blocks import RemoteBlocks
 
 #: Bytes of a product with S, measured on one core.
 BYTES_PER_SECOND = 6e9
@@ -90,7 +90,7 @@ def _advance(x, r, p, Sp, b, alpha):
 
 @register_linear_solver("pcg")
 class ConjugateGradients:
-    """Preconditioned conjugate gradients on the blocks, and on those that are elsewhere, if there are any."""
+    """Preconditioned conjugate gradients on the blocks, and on those of other processes, if there are any."""
 
     name = "pcg"
     #: Stop when one more iteration improves the quadratic model by less than this share of its mean improvement.
@@ -100,14 +100,14 @@ class ConjugateGradients:
     mixed_tolerance = 0.01
     max_iterations = 500
 
-    def __init__(self, layout: Layout, elsewhere: Elsewhere | None = None) -> None:
-        self._layout, self._elsewhere = layout, elsewhere
+    def __init__(self, layout: Layout, remote: RemoteBlocks | None = None) -> None:
+        self._layout, self._remote = layout, remote
         self.num_iterations = 0
         self.residual: list[FloatArray] | None = None
 
     @cached_property
     def _coarse(self) -> CoarseSpace | None:
-        return coarse_space(self._layout, self._elsewhere)
+        return coarse_space(self._layout, self._remote)
 
     def expected_seconds(self) -> float:
         """Return the time of the products with S in as many iterations as a step takes."""
@@ -142,8 +142,8 @@ class ConjugateGradients:
             Sp[:] = 0.0
             for arguments in sums:
                 add_block_products(*arguments)
-            if self._elsewhere is not None:
-                self._elsewhere.add_products(p_parts, Sp_parts)
+            if self._remote is not None:
+                self._remote.add_products(p_parts, Sp_parts)
             curvature = float(p @ Sp)
             if not curvature > 0.0:
                 if k == 1:

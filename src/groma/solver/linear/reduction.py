@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The reduced system at one place, for one damping after the other."""
+"""The reduced system at the present states, for one damping after the other."""
 
 from __future__ import annotations
 
+from groma._stopwatch import Stopwatch
 from groma._typing import FloatArray
 from groma.problem.layout import Chunk
 from groma.problem.linearization import NormalEquations
 from groma.solver.linear.contract import LinearSolver
 from groma.solver.linear.schur import ReducedSystem
-from groma.solver.report import Stopwatch
 from groma.solver.steps import States
 
 
@@ -44,9 +44,9 @@ class Reduction:
         return cost
 
     def form(self, states: States, inputs: list[tuple], damping: float) -> None:
-        """Do the missing part of :meth:`linearize`: for another damping, landmarks are eliminated again.
+        """Form the reduced system for states and a damping, with as little work as the last call allows.
 
-        Compact equations are linearised for that, too.
+        For another damping alone landmarks are eliminated again; compact equations are linearised, too.
         """
         if states is not self._states or (damping != self._damping and self.equations.compact):
             self.linearize(states, inputs, damping)

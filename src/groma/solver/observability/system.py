@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from groma._rows import connected_parts
+from groma._rows import connected_parts, pointers_of
 from groma._typing import BoolArray, FloatArray
 from groma.solver.linear.blocks import Blocks
 from groma.solver.linear.modes import Modes, divided, scaled
@@ -25,7 +25,7 @@ LEAST = 1e-13
 def separate_parts(inspection: Inspection) -> list[Finding]:
     """Find groups of kept variables that share nothing."""
     layout, findings = inspection.layout, []
-    first = np.concatenate([[0], np.cumsum([c.count for c in layout.kept])])
+    first = pointers_of([c.count for c in layout.kept])
     rows = np.concatenate([first[a] + r for (a, _), (r, _) in layout.blocks.items()])
     columns = np.concatenate([first[b] + c for (_, b), (_, c) in layout.blocks.items()])
     label = connected_parts(rows, columns, int(first[-1]))

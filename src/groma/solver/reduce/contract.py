@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How processes that solve one problem together combine what they found; ``alone.py`` and ``mpi.py`` fulfil it."""
+"""How processes that solve one problem together combine what they found; ``single.py`` and ``mpi.py`` fulfil it."""
 
 from __future__ import annotations
 

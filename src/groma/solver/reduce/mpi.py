@@ -21,8 +21,8 @@ from groma._typing import ComplexArray, IntArray
 from groma.errors import InputError
 from groma.execution import available_cores
 from groma.solver.reduce import exact_sums
-from groma.solver.reduce.alone import Alone
 from groma.solver.reduce.contract import Reducer
+from groma.solver.reduce.single import SingleProcess
 
 #: Environment variables of the rank and the number of ranks: MPICH and its kin, Open MPI, srun --mpi=pmix.
 LAUNCHERS = (
@@ -126,7 +126,7 @@ def reducer_of_launcher() -> Reducer:
     InputError
         As :class:`Ranks`.
     """
-    return Ranks() if started_as()[1] > 1 else Alone()
+    return Ranks() if started_as()[1] > 1 else SingleProcess()
 
 
 def _add(others: Any, sums: Any, _datatype: Any) -> None:

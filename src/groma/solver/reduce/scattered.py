@@ -27,7 +27,7 @@ Scattered = tuple[int, int, IntArray, IntArray, FloatArray]
 
 
 class ScatteredBlocks:
-    """Blocks off the diagonal, by shard; a :class:`groma.solver.linear.elsewhere.Elsewhere`.
+    """Blocks off the diagonal, by shard; a :class:`groma.solver.linear.remote_blocks.RemoteBlocks`.
 
     Parameters
     ----------

@@ -26,6 +26,7 @@ from functools import partial
 
 import numpy as np
 
+from groma._stopwatch import Stopwatch
 from groma._typing import FloatArray
 from groma.errors import ProblemError
 from groma.problem.linearization import NormalEquations, to_original_order, to_solver_order
@@ -36,12 +37,12 @@ from groma.solver.levenberg_marquardt import damping_from, predicted_decrease
 from groma.solver.linear.blas import one_blas_thread
 from groma.solver.linear.schur import ReducedSystem
 from groma.solver.options import DAMPING, SolverOptions, first_damping
-from groma.solver.reduce.alone import Alone
 from groma.solver.reduce.contract import Reducer
 from groma.solver.reduce.journal import Journal, Waypoint
 from groma.solver.reduce.shard import OpenShard, Shard, Shelf
 from groma.solver.reduce.shared_system import NUM_FOUND, SharedSystem
-from groma.solver.report import SolveReport, Stopwatch
+from groma.solver.reduce.single import SingleProcess
+from groma.solver.report import SolveReport
 from groma.solver.solve import Progress, minimise
 from groma.solver.standing import Standing
 from groma.solver.steps import States, share_of_states, squares_of_states, squares_of_step
@@ -103,10 +104,10 @@ def solve_shards(
     ProblemError
         If landmarks are in no shard or in two, or a factor of a shard does not fit.
     """
-    options, reducer = options or SolverOptions(), reducer or Alone()
+    options, reducer = options or SolverOptions(), reducer or SingleProcess()
     _check(variables, shards, reducer)
     report = SolveReport()
-    watch = Stopwatch(report)
+    watch = Stopwatch(report.seconds)
     report.threads = options.threads or reducer.num_cores
     workers = Workers(report.threads)
     try:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from groma._stopwatch import Stopwatch
 from groma._typing import FloatArray
 from groma.geometry import se3
 from groma.solver.report import SolveReport
@@ -34,7 +35,6 @@ from groma.tracking.map.track_map import TrackMap
 from groma.tracking.options import TrackOptions
 from groma.tracking.pose.following import carry, find_points_again
 from groma.tracking.result import map_to_scene
-from groma.tracking.stopwatch import Stopwatch
 
 
 @dataclass
@@ -212,7 +212,7 @@ class Mapper:
             self.take_up(present, now=True)
         with watch("keyframe"):
             pose = se3.compose(chosen.relative[None], self.map.pose_of(chosen.near)[None])[0]
-            followed = add_keyframe(self.map, self.camera, chosen.data, pose, chosen.followed, self.options)
+            followed = add_keyframe(self.map, chosen.data, pose, chosen.followed)
             if chosen.data is present.data:
                 present.followed = followed
             elif present.data is not None:

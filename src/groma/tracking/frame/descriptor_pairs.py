@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._numba import kernel, loop
+from groma._rows import pointers_of
 from groma._typing import FloatArray, IntArray
 
 #: Width of the cells into which features are sorted, pixels (cost: number of comparisons).
@@ -138,7 +139,7 @@ class PlacedFeatures:
         columns = int(column.max(initial=0)) + 1
         cell = row * columns + column
         order = np.argsort(cell, kind="stable")
-        begin = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=(row.max(initial=-1) + 1) * columns))])
+        begin = pointers_of(np.bincount(cell, minlength=(row.max(initial=-1) + 1) * columns))
         return cls(pixel[order], descriptor[order].view(np.uint64), order, begin, columns)
 
 

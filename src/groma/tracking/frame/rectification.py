@@ -169,7 +169,9 @@ def retargeted_ends(
     return _retargeted_inverse(camera, ends.reshape(-1, 2), inverse.ravel(), old, new).reshape(-1, 2)
 
 
-def _retargeted_inverse(camera: TrackCamera, pixels: FloatArray, inverse: FloatArray, old, new) -> FloatArray:
+def _retargeted_inverse(
+    camera: TrackCamera, pixels: FloatArray, inverse: FloatArray, old: FloatArray, new: FloatArray
+) -> FloatArray:
     scale = camera.fx * camera.baseline
     right = pixels - np.column_stack([scale * inverse, np.zeros(len(pixels))])
     return (pixels[:, 0] - retargeted(camera, right, old, new)[:, 0]) / scale

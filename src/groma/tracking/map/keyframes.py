@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.features.point_tracks import spread
 from groma.features.segments import SEGMENTS
 from groma.geometry import se3
@@ -15,7 +15,6 @@ from groma.scene.landmarks import Lines
 from groma.tracking.frame.camera import TrackCamera, back, into
 from groma.tracking.frame.features import Features, FrameFeatures
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
-from groma.tracking.gates import LineGates
 from groma.tracking.map.feature_points import linked_to_points, place_by_motion
 from groma.tracking.map.landmarks import ALIVE, PENDING
 from groma.tracking.map.lines import FollowedSegments, assign, expected_segments, line_ends
@@ -72,22 +71,15 @@ def keyframe_nearby(track_map: TrackMap, pose: FloatArray, options: TrackOptions
     return living[best] if far[best] < options.gates.keyframes.nearby else None
 
 
-def add_keyframe(
-    track_map: TrackMap,
-    camera: TrackCamera,
-    data: FrameFeatures,
-    pose: FloatArray,
-    followed: Followed,
-    options: TrackOptions,
-) -> Followed:
+def add_keyframe(track_map: TrackMap, data: FrameFeatures, pose: FloatArray, followed: Followed) -> Followed:
     """Make a keyframe of a frame with a pose; return the features tracked from now on."""
     index = len(track_map.keyframes)
-    tracks, features = _add_points(track_map, camera, data, pose, followed.points, index, options)
+    tracks, features = _add_points(track_map, data, pose, followed.points, index)
     segments, lines = followed.lines, LineMeasurements.empty()
-    if options.lines:
-        segments, lines = _add_lines(track_map, camera, data, pose, followed.lines, index, options)
+    if data.options.lines:
+        segments, lines = _add_lines(track_map, data, pose, followed.lines, index)
     planes = _add_planes(track_map, data, pose) if data.planes is not None else PlaneMeasurements.empty()
-    measured = Measurements(measure_points(data, tracks, options, track_map, pose, camera), lines, planes)
+    measured = Measurements(measure_points(track_map, data, pose, tracks), lines, planes)
     name, time = data.frame.name, data.frame.timestamp
     keyframe = Keyframe(index, time, name, pose.copy(), data.gray, measured, features, data.depth_grid)
     alive = measured.points.index[track_map.points.alive[measured.points.index]]
@@ -99,15 +91,10 @@ def add_keyframe(
 
 
 def measure_points(
-    data: FrameFeatures,
-    tracks: PointTracks,
-    options: TrackOptions,
-    track_map: TrackMap,
-    pose: FloatArray,
-    camera: TrackCamera,
+    track_map: TrackMap, data: FrameFeatures, pose: FloatArray, tracks: PointTracks
 ) -> PointMeasurements:
     """Return the measurements of tracked points: pixel, and depth or right column where known."""
-    count = len(tracks)
+    count, camera = len(tracks), data.camera
     unknown = np.full(count, np.nan)
     depth, right = unknown, np.full((count, 2), np.nan)
     if data.frame.depth is not None:
@@ -116,7 +103,7 @@ def measure_points(
         z = np.where(track_map.points.alive[tracks.index], into(pose, track_map.points.xyz[tracks.index])[:, 2], np.nan)
         expected = tracks.pixel[:, 0] - camera.fx * camera.baseline / np.where(z > 0, z, np.nan)
         right = data.right_pixels(tracks.pixel, expected)
-    sigma = np.full(count, options.point_sigma_px)
+    sigma = np.full(count, data.options.point_sigma_px)
     return PointMeasurements(tracks.index, tracks.pixel, sigma, depth, data.depth_sigma(depth), right)
 
 
@@ -124,68 +111,75 @@ def measure_points(
 
 
 def _add_points(
-    track_map, camera, data, pose, tracks: PointTracks, index: int, options
+    track_map: TrackMap, data: FrameFeatures, pose: FloatArray, tracks: PointTracks, index: int
 ) -> tuple[PointTracks, Features]:
     """Triangulate pending points, start new ones, and link described features to points."""
-    points, gates = track_map.points, options.gates.points
-    features = data.features
-    _place_pending(track_map, camera, data, pose, tracks)
+    points, options, features = track_map.points, data.options, data.features
+    gates = options.gates.points
+    _place_pending(track_map, data, pose, tracks)
     if len(tracks):
         points.keyframe[tracks.index], points.pixel[tracks.index], points.misses[tracks.index] = index, tracks.pixel, 0
-    if options.points:
-        # Described features near tracked points belong to them.
-        features = linked_to_points(features, tracks, gates.same_feature)
-        depthless = data.frame.depth is None and data.frame.right is None
-        if depthless and track_map.keyframes and points.alive[tracks.index].sum() < gates.few * options.num_points:
-            # After a wide step few points are tracked, but many features match.
-            before = track_map.near
-            placed, features = place_by_motion(track_map, camera, before, features, pose, tracks.index, options)
-            tracks = tracks.joined(placed)
-        # New points: described features first, then corners where there are none.
-        room = max(options.num_points - len(tracks), 0)
-        cell = data.corner_cell
-        free = np.flatnonzero(features.point < 0)
-        strongest = spread(features.pixel[free], features.response[free], tracks.pixel, data.gray.shape, room, cell)
-        free = free[strongest]
-        new = [features.pixel[free]]
-        room -= len(free)
-        if room > 0:
-            found = data.corners
-            taken = np.concatenate([tracks.pixel, new[0]])
-            rank = -np.arange(len(found), dtype=float)
-            new.append(found[spread(found, rank, taken, data.gray.shape, room, cell)])
-        pixel = np.concatenate(new)
-        pixel_rows = camera.inside(pixel, gates.border)
-        rows = points.extend(int(pixel_rows.sum()))
-        every = np.full(len(pixel), -1, dtype=np.int64)
-        every[pixel_rows] = rows
-        features = features.linked(free, every[: len(free)])
-        pixel = pixel[pixel_rows]
-        points.keyframe[rows], points.pixel[rows] = index, pixel
-        points.first_keyframe[rows], points.first_pixel[rows] = index, pixel
-        depth = data.depths(pixel)
-        known = np.isfinite(depth)
-        points.xyz[rows[known]] = back(pose, camera.bearings(pixel[known]) * depth[known, None])
-        points.state[rows[known]] = ALIVE
-        tracks = tracks.joined(PointTracks(rows, pixel))
-    return tracks, features
+    if not options.points:
+        return tracks, features
+    # Described features near tracked points belong to them.
+    features = linked_to_points(features, tracks, gates.same_feature)
+    depthless = data.frame.depth is None and data.frame.right is None
+    if depthless and track_map.keyframes and points.alive[tracks.index].sum() < gates.few * options.num_points:
+        # After a wide step few points are tracked, but many features match.
+        before = track_map.near
+        placed, features = place_by_motion(track_map, data.camera, before, features, pose, tracks.index, options)
+        tracks = tracks.joined(placed)
+    return _new_points(track_map, data, pose, tracks, features, index)
 
 
-def _place_pending(track_map: TrackMap, camera: TrackCamera, data: FrameFeatures, pose, tracks: PointTracks) -> None:
+def _new_points(
+    track_map: TrackMap, data: FrameFeatures, pose: FloatArray, tracks: PointTracks, features: Features, index: int
+) -> tuple[PointTracks, Features]:
+    """Start points where none is tracked: at described features first, then at corners where there are none."""
+    points, camera, shape, cell = track_map.points, data.camera, data.gray.shape, data.corner_cell
+    room = max(data.options.num_points - len(tracks), 0)
+    free = np.flatnonzero(features.point < 0)
+    free = free[spread(features.pixel[free], features.response[free], tracks.pixel, shape, room, cell)]
+    pixel = features.pixel[free]
+    if room > len(free):
+        found, taken = data.corners, np.concatenate([tracks.pixel, pixel])
+        rank = -np.arange(len(found), dtype=float)
+        pixel = np.concatenate([pixel, found[spread(found, rank, taken, shape, room - len(free), cell)]])
+    inside = camera.inside(pixel, data.options.gates.points.border)
+    rows = points.extend(int(inside.sum()))
+    every = np.full(len(pixel), -1, dtype=np.int64)
+    every[inside] = rows
+    features, pixel = features.linked(free, every[: len(free)]), pixel[inside]
+    points.keyframe[rows], points.pixel[rows] = index, pixel
+    points.first_keyframe[rows], points.first_pixel[rows] = index, pixel
+    _place_by_depth(track_map, data, pose, rows, pixel)
+    return tracks.joined(PointTracks(rows, pixel)), features
+
+
+def _place_by_depth(
+    track_map: TrackMap, data: FrameFeatures, pose: FloatArray, index: IntArray, pixel: FloatArray
+) -> BoolArray:
+    """Place points where the frame has a depth; return which (n,)."""
+    depth = data.depths(pixel)
+    known = np.isfinite(depth)
+    track_map.points.xyz[index[known]] = back(pose, data.camera.bearings(pixel[known]) * depth[known, None])
+    track_map.points.state[index[known]] = ALIVE
+    return known
+
+
+def _place_pending(track_map: TrackMap, data: FrameFeatures, pose: FloatArray, tracks: PointTracks) -> None:
     """Initialise pending points by depth, or by triangulation with the keyframe that first saw them."""
     points = track_map.points
     pending = np.flatnonzero(points.state[tracks.index] == PENDING)
     if not len(pending):
         return
     index, pixel = tracks.index[pending], tracks.pixel[pending]
-    depth = data.depths(pixel)
-    known = np.isfinite(depth)
-    points.xyz[index[known]] = back(pose, camera.bearings(pixel[known]) * depth[known, None])
-    points.state[index[known]] = ALIVE
+    known = _place_by_depth(track_map, data, pose, index, pixel)
     index, pixel = index[~known], pixel[~known]
     if len(index):
         first = _poses_of(track_map, points.first_keyframe[index])
-        places, good = triangulate(camera, first, points.first_pixel[index], pose, pixel, data.options.gates.points)
+        gates = data.options.gates.points
+        places, good = triangulate(data.camera, first, points.first_pixel[index], pose, pixel, gates)
         points.xyz[index[good]] = places[good]
         points.state[index[good]] = ALIVE
 
@@ -199,9 +193,11 @@ def _poses_of(track_map: TrackMap, keyframes: IntArray) -> FloatArray:
 # ----------------------------------------------------------------------------------------------------------- lines
 
 
-def _add_lines(track_map, camera, data, pose, followed: FollowedSegments, index: int, options):
+def _add_lines(
+    track_map: TrackMap, data: FrameFeatures, pose: FloatArray, followed: FollowedSegments, index: int
+) -> tuple[FollowedSegments, LineMeasurements]:
     """Assign detected segments to tracked lines and to lines of the map, and start new lines with the rest."""
-    lines, detected, gates = track_map.lines, data.detected, options.gates.lines
+    lines, detected, gates = track_map.lines, data.detected, data.options.gates.lines
     segments = detected.segments
     of_segment = np.full(len(segments), -1)
     # Segments of tracked lines.
@@ -210,7 +206,7 @@ def _add_lines(track_map, camera, data, pose, followed: FollowedSegments, index:
     # Segments of other lines of the map.
     alive = np.flatnonzero(lines.alive)
     alive = alive[~np.isin(alive, of_segment)]
-    expected, seen = expected_segments(camera, lines, alive, pose, gates)
+    expected, seen = expected_segments(data.camera, lines, alive, pose, gates)
     alive, expected = alive[seen], expected[seen]
     free = np.flatnonzero(of_segment < 0)
     middle = 1.0 / np.maximum(into(pose, lines.segment[alive].mean(axis=1))[:, 2], 1e-6)
@@ -218,17 +214,17 @@ def _add_lines(track_map, camera, data, pose, followed: FollowedSegments, index:
     rows, hits = assign(expected, segments.ends[free], gates.distance, SEGMENTS.angle, middle, inverse[free], gates)
     of_segment[free[hits]] = alive[rows]
     # New lines: initialised by depth along the segment, else tracked until they can be triangulated.
-    free = np.flatnonzero(of_segment < 0)[: max(options.num_lines - int((of_segment >= 0).sum()), 0)]
+    free = np.flatnonzero(of_segment < 0)[: max(data.options.num_lines - int((of_segment >= 0).sum()), 0)]
     new = lines.extend(len(free))
     of_segment[free] = new
     lines.strength[new] = segments.strength[free]
     lines.first_keyframe[new], lines.first_ends[new] = index, segments.ends[free]
-    place_from_depth(track_map, camera, pose, new, segments.ends[free], detected, free, gates)
+    _place_from_depth(track_map, data, pose, new, free)
     rows = np.flatnonzero(of_segment >= 0)
     known = of_segment[rows]
-    _place_pending_lines(track_map, camera, pose, known, segments.ends[rows], detected, rows, index, gates)
+    _place_pending_lines(track_map, data, pose, known, rows, index)
     lines.strength[known] = segments.strength[rows]
-    _extend_lines(track_map, camera, pose, known, segments.ends[rows], gates.max_extension)
+    _extend_lines(track_map, data, pose, known, rows)
     sigma = np.maximum(segments.sigma[rows], gates.min_sigma)
     table = LineMeasurements(
         known, segments.ends[rows], sigma, detected.inverse_depth[rows], detected.inverse_depth_sigma[rows]
@@ -239,8 +235,12 @@ def _add_lines(track_map, camera, data, pose, followed: FollowedSegments, index:
     return followed.take(first), table.take(first)
 
 
-def place_from_depth(track_map, camera, pose, index, ends, detected, rows, gates: LineGates) -> None:
-    """Initialise lines whose segment has a sufficiently certain depth."""
+def _place_from_depth(
+    track_map: TrackMap, data: FrameFeatures, pose: FloatArray, index: IntArray, rows: IntArray
+) -> None:
+    """Initialise lines ``index`` whose detected segment, one of ``rows``, has a sufficiently certain depth."""
+    camera, detected, gates = data.camera, data.detected, data.options.gates.lines
+    ends = detected.segments.ends[rows]
     inverse, sigma = detected.inverse_depth[rows], detected.inverse_depth_sigma[rows]
     with np.errstate(invalid="ignore", divide="ignore"):
         depth = 1.0 / inverse
@@ -252,24 +252,29 @@ def place_from_depth(track_map, camera, pose, index, ends, detected, rows, gates
     _place(track_map, index[good], back(pose, in_cam[good]))
 
 
-def _place(track_map: TrackMap, index, segments: FloatArray) -> None:
+def _place(track_map: TrackMap, index: IntArray, segments: FloatArray) -> None:
     if len(index):
         table = Lines.through(segments)
         track_map.lines.plucker[index], track_map.lines.segment[index] = table.plucker, table.segments
         track_map.lines.state[index] = ALIVE
 
 
-def _place_pending_lines(track_map, camera, pose, known, ends, detected, rows, index, gates) -> None:
-    """Initialise pending lines by depth, or by the planes through two camera centres and the segments."""
-    lines = track_map.lines
+def _place_pending_lines(
+    track_map: TrackMap, data: FrameFeatures, pose: FloatArray, known: IntArray, rows: IntArray, index: int
+) -> None:
+    """Initialise pending lines by depth, or by the planes through two camera centres and the segments.
+
+    Line ``known[k]`` is seen as the detected segment ``rows[k]`` in keyframe ``index``.
+    """
+    lines, camera, gates = track_map.lines, data.camera, data.options.gates.lines
     pending = np.flatnonzero((lines.state[known] == PENDING) & (lines.first_keyframe[known] < index))
     if not len(pending):
         return
-    place_from_depth(track_map, camera, pose, known[pending], ends[pending], detected, rows[pending], gates)
+    _place_from_depth(track_map, data, pose, known[pending], rows[pending])
     pending = pending[lines.state[known[pending]] == PENDING]
     if not len(pending):
         return
-    row, segment = known[pending], ends[pending]
+    row, segment = known[pending], data.detected.segments.ends[rows[pending]]
     first = _poses_of(track_map, lines.first_keyframe[row])
     normal1, center1 = _ray_planes(camera, first, lines.first_ends[row])
     normal2, center2 = _ray_planes(camera, np.tile(pose, (len(row), 1)), segment)
@@ -301,20 +306,22 @@ def _ray_planes(camera: TrackCamera, poses: FloatArray, ends: FloatArray) -> tup
     return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12), center
 
 
-def _extend_lines(track_map: TrackMap, camera: TrackCamera, pose, index, ends, max_extension: float) -> None:
-    """Extend lines to their observed segments."""
+def _extend_lines(
+    track_map: TrackMap, data: FrameFeatures, pose: FloatArray, known: IntArray, segments: IntArray
+) -> None:
+    """Extend the lines ``known`` to the detected segments that show them."""
     lines = track_map.lines
-    alive = np.flatnonzero(lines.alive[index])
-    rows = index[alive]
+    alive = np.flatnonzero(lines.alive[known])
+    rows = known[alive]
     if not len(rows):
         return
-    seen, good = line_ends(camera, pose, lines.plucker[rows], ends[alive])
+    seen, good = line_ends(data.camera, pose, lines.plucker[rows], data.detected.segments.ends[segments[alive]])
     direction = lines.plucker[rows, 3:]
     foot = np.cross(direction, lines.plucker[rows, :3])
     along = np.einsum("lej,lj->le", np.concatenate([lines.segment[rows], seen], axis=1), direction)
     old = np.abs(along[:, 1] - along[:, 0])
     low, high = along.min(axis=1), along.max(axis=1)
-    good &= (high - low) < max_extension * old + 1e-9
+    good &= (high - low) < data.options.gates.lines.max_extension * old + 1e-9
     segment = foot[:, None] + np.stack([low, high], axis=1)[..., None] * direction[:, None]
     forward = ((lines.segment[rows, 1] - lines.segment[rows, 0]) * direction).sum(axis=1) > 0
     segment = np.where(forward[:, None, None], segment, segment[:, ::-1])

@@ -115,12 +115,12 @@ def _add_landmarks(track_map: TrackMap, scene: Scene) -> None:
 
 def _add_keyframe(track_map: TrackMap, scene: Scene, image: int, data: FrameFeatures) -> None:
     """Add the keyframe of an image of the scene, with all that was measured in it."""
-    options, camera, pose = data.options, data.camera, scene.cam_from_world[image]
+    options, pose = data.options, scene.cam_from_world[image]
     seen = scene.point_observations
     rows = np.flatnonzero(seen.image_idx == image)
     tracks = PointTracks(seen.point_idx[rows], seen.pixel[rows])
     tracks = tracks.take(np.unique(tracks.index, return_index=True)[1])
-    points = measure_points(data, tracks, options, track_map, pose, camera)
+    points = measure_points(track_map, data, pose, tracks)
     features = linked_to_points(data.features, tracks, options.gates.points.same_feature)
     measured = Measurements(points, _lines(track_map, scene, image, data), _planes(track_map, scene, image, data))
     depth = float(np.median(into(pose, track_map.points.xyz[tracks.index])[:, 2])) if len(tracks) else 1.0

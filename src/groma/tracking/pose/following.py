@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 
+from groma._stopwatch import Stopwatch
 from groma._typing import FloatArray
 from groma.features.point_tracks import POINT_TRACKS, follow
 from groma.tracking.beside import beside
@@ -45,7 +46,7 @@ def follow_frame(
     followed: Followed,
     previous: FloatArray,
     expected: tuple[FloatArray, FloatArray],
-    watch,
+    watch: Stopwatch,
     pool: Executor | None = None,
     searched: bool = False,
 ) -> tuple[PoseEstimate | None, Followed]:
@@ -70,7 +71,7 @@ def follow_frame(
             )
     alive = track_map.points.alive[tracks.index]
     with watch("depth"):
-        measured = measure_points(data, tracks.take(alive), options, track_map, predicted, camera)
+        measured = measure_points(track_map, data, predicted, tracks.take(alive))
         if not options.points:
             measured = PointMeasurements.empty()
     # Planes before lines: where the thread beside is still busy with lines, this one finds the planes meanwhile.

@@ -114,9 +114,9 @@ class Initialiser:
         assert self._first is not None
         options, camera = self._options, self._camera
         if self._second is None:
-            followed = add_keyframe(track_map, camera, self._first, IDENTITY, Followed.nothing(), options)
+            followed = add_keyframe(track_map, self._first, IDENTITY, Followed.nothing())
             return followed, IDENTITY.copy()
-        followed = add_keyframe(track_map, camera, self._first, IDENTITY, Followed.nothing(), options)
+        followed = add_keyframe(track_map, self._first, IDENTITY, Followed.nothing())
         # The points of the first frame, followed once more to the second.
         tracks = followed.points
         start, end = self._views[0], self._views[-1]
@@ -130,7 +130,7 @@ class Initialiser:
         index = tracks.index[placed]
         track_map.points.xyz[index], track_map.points.state[index] = places[placed], ALIVE
         followed = Followed(tracks, FollowedSegments.empty())
-        followed = add_keyframe(track_map, camera, self._second, self._pose, followed, options)
+        followed = add_keyframe(track_map, self._second, self._pose, followed)
         return followed, self._pose.copy()
 
 

@@ -139,7 +139,9 @@ def write_report(
     numbers = report.to_dict() if report is not None else None
     history = [step for step in report.history if _charts.entry(step)["iteration"] > 0] if report is not None else None
     said = contents or PageContents()
-    sentences = said.warnings if said.warnings is not None else report.warnings if report is not None else ()
+    sentences = said.warnings
+    if sentences is None:
+        sentences = () if report is None else report.warnings
     diagnosis = said.diagnosis
     if diagnosis is None and numbers is not None:
         diagnosis = numbers.get("diagnosis")

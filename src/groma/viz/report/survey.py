@@ -37,7 +37,8 @@ def _measurements(numbers: Mapping[str, Any]) -> str:
         cells = [f"{one['kind']} {one['name']} {one['coordinate']}".rstrip(), f"{one['sigma']:.4g}"]
         cells += [f"{one['residual']:.4f}", f"{one['redundancy']:.2f}"]
         cells += ["-" if one[name] is None else f"{one[name]:.3g}" for name in ("normalized", "detectable")]
-        rows.append([*cells, "taken out" if one["is_rejected"] else "suspect" if one["is_suspect"] else ""])
+        suspect = "suspect" if one["is_suspect"] else ""
+        rows.append([*cells, "taken out" if one["is_rejected"] else suspect])
     left = len(order) - len(rows)
     caption = (
         "Residuals (measured less computed), worst first. r: how far the others check a measurement, from 0 to 1; "

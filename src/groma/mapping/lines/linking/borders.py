@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from groma._rows import connected_parts
+from groma._rows import connected_parts, pointers_of
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.mapping.groups import distinct_pairs
 from groma.mapping.lines.gates import AGREEMENT
@@ -71,7 +71,7 @@ class _Versions:
     def of(found: Sequence[Found], image_idx: IntArray) -> _Versions:
         """Number the lines of all clusters."""
         counts = [len(one.lines) for one in found]
-        first = np.concatenate([[0], np.cumsum(counts)])
+        first = pointers_of(counts)
         version = np.concatenate([first[k] + one.line_idx for k, one in enumerate(found)])
         row = np.concatenate([one.rows for one in found])
         return _Versions(np.repeat(np.arange(len(found)), counts), version, row, image_idx[row])

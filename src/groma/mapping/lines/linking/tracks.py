@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from groma._rows import pointers_of
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.line_ends import SegmentRays, trim
 from groma.execution import map_ranges
@@ -172,7 +173,7 @@ class Tracks:
         stale = self.stale
         for k in range(self.gates.fitting_rounds):
             which, here = np.flatnonzero(stale), stale[line]
-            mine, ends = rows[here], np.concatenate([[0], np.cumsum(np.diff(pointers)[which])])
+            mine, ends = rows[here], pointers_of(np.diff(pointers)[which])
             fit = fit_lines(views, self.sigma, ends, mine, active[here], lines[which])
             squared[here], uncertainty[which], unchecked[which] = fit.squared, fit.uncertainty, fit.unchecked
             lines[which], front = trim(seen, ends, mine, active[here], fit.X)

@@ -12,7 +12,7 @@ from groma.errors import GromaError, InputError
 from groma.solver.reduce.contract import Reducer
 
 
-class ToldByAllError(InputError):
+class AllRanksError(InputError):
     """An error that all processes have; one of them reports it."""
 
 
@@ -38,4 +38,4 @@ def agreed(reducer: Reducer) -> Iterator[None]:
     if first is None:
         return
     text = told[first] if all(told) else f"Rank {first} of {reducer.size}: {told[first]}"
-    raise ToldByAllError(text) from own
+    raise AllRanksError(text) from own

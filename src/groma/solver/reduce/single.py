@@ -7,7 +7,7 @@ from groma._typing import ComplexArray, IntArray
 from groma.execution import available_cores
 
 
-class Alone:
+class SingleProcess:
     """A :class:`groma.solver.reduce.contract.Reducer` for a single process."""
 
     rank, size, num_neighbours = 0, 1, 1

@@ -18,7 +18,7 @@ class OnDemand:
         self.result = work
 
 
-class Behind:
+class DeferredTask:
     """Runs one task at a time, optionally in its own thread."""
 
     def __init__(self, threaded: bool) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Blocks of a reduced system that are not at hand: other processes multiply them."""
+"""Blocks of a reduced system that other processes hold, and multiply with vectors."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Protocol
 from groma._typing import FloatArray, IntArray
 
 
-class Elsewhere(Protocol):
+class RemoteBlocks(Protocol):
     """Blocks off the diagonal that conjugate gradients need products of; all processes call the same methods."""
 
     def pairs(self, c: int) -> tuple[IntArray, IntArray]:
