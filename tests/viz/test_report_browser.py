@@ -243,10 +243,9 @@ def test_distance_of_two_points_with_its_standard_deviation(opened, scene, covar
     along = way / np.linalg.norm(way)
     sigma = np.sqrt(along @ (covariances.points[3] + covariances.points[9]) @ along)
     value, spread = _measured(page)["Distance of the picks"].split(" ± ")
-    assert len(value.partition(".")[2]) == len(spread.partition(".")[2])  # both end at the same digit
-    value, spread = float(value), float(spread)
-    assert value == pytest.approx(np.linalg.norm(way), abs=0.051 * sigma)  # half of the second digit of sigma
-    assert spread == pytest.approx(sigma, rel=0.06)  # two digits
+    assert len(value.partition(".")[2]) == len(spread.partition(".")[2])  # both end at the second digit of the spread
+    assert float(value) == pytest.approx(np.linalg.norm(way), abs=0.051 * sigma)
+    assert float(spread) == pytest.approx(sigma, rel=0.06)
     page.evaluate("() => { paint(); drawImage(); }")
     assert page.evaluate(ORANGE, "marks") > 50
 
