@@ -240,13 +240,11 @@ def test_distance_of_two_points_with_its_standard_deviation(opened, scene, covar
     for point in (3, 9):
         _click(page, scene.points.xyz[point])
     way = scene.points.xyz[9] - scene.points.xyz[3]
-    along = way / np.linalg.norm(way)
-    sigma = np.sqrt(along @ (covariances.points[3] + covariances.points[9]) @ along)
+    sigma = np.sqrt(way @ (covariances.points[3] + covariances.points[9]) @ way) / np.linalg.norm(way)
     value, spread = _measured(page)["Distance of the picks"].split(" ± ")
-    assert len(value.partition(".")[2]) == len(spread.partition(".")[2])  # both end at the same digit
-    value, spread = float(value), float(spread)
-    assert value == pytest.approx(np.linalg.norm(way), abs=0.051 * sigma)  # half of the second digit of sigma
-    assert spread == pytest.approx(sigma, rel=0.06)  # two digits
+    assert len(value.partition(".")[2]) == len(spread.partition(".")[2])  # both end at the second digit of the spread
+    assert float(value) == pytest.approx(np.linalg.norm(way), abs=0.051 * sigma)
+    assert float(spread) == pytest.approx(sigma, rel=0.06)
     page.evaluate("() => { paint(); drawImage(); }")
     assert page.evaluate(ORANGE, "marks") > 50
 
@@ -302,7 +300,7 @@ def test_distance_of_a_line_from_a_point_uses_moments_about_the_offset(opened, s
     variance = slope @ covariances.lines[line] @ slope + unit @ covariances.points[point] @ unit
     told = next(text for name, text in _measured(page).items() if "perpendicular" in name)
     value, spread = map(float, told.split(" ± "))
-    assert value == pytest.approx(np.linalg.norm(off), rel=2e-4)
+    assert value == pytest.approx(np.linalg.norm(off), abs=0.051 * spread)
     # |d| = 1 is kept by the page and not by the differences; that part runs along the line.
     assert spread == pytest.approx(np.sqrt(variance), rel=0.15)
 
