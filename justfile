@@ -27,6 +27,10 @@ format:
 test *arguments:
     .venv/bin/pytest -n auto {{arguments}}
 
+# tests that take long
+test-slow:
+    .venv/bin/pytest -n auto -m slow
+
 # kernels as plain Python: real tracebacks, real coverage
 test-plain:
     NUMBA_DISABLE_JIT=1 .venv/bin/pytest -n auto -m "kernels and not compiled and not slow"

@@ -25,7 +25,6 @@ extensions = [
     "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
-    "sphinx.ext.viewcode",
     "_factor_table",
     "_figures",
     "_formulas",
@@ -126,8 +125,11 @@ def _parse_attribute_as_text(self: NumpyDocstring) -> list[str]:
 
 
 def setup(app: Sphinx) -> None:
-    """Register the four above."""
+    """Register the four above, and links to pages of the sources."""
     app.connect("autodoc-process-signature", _shorten_signature)
     app.connect("doctree-read", _shorten_attributes)
     NumpyDocstring._parse_attribute_docstring = _parse_attribute_as_text
     app.connect("autodoc-process-docstring", _escape_signs)
+    # Pages of the sources, six of seven of all pages, are left out where pages are only checked: sphinx-build -t check.
+    if not app.tags.has("check"):
+        app.setup_extension("sphinx.ext.viewcode")

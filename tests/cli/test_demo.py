@@ -11,6 +11,7 @@ import pytest
 
 from groma.cli.main import run
 from groma.evaluation import cabinet as _cabinet
+from groma.factors import contract, registered
 from groma.io import read_scene
 from groma.scene import Lines, Similarity
 
@@ -125,7 +126,15 @@ def test_demo(tmp_path, monkeypatch, capsys):
     np.testing.assert_allclose(numbers["cabinet"]["size"], numbers["cabinet"]["size_measured"], atol=0.03)
 
 
-def test_selfcheck(capsys):
+@pytest.fixture
+def two_factors(monkeypatch):
+    """A registry of two factors, and all cameras; tests/factors/test_selfcheck.py checks every factor."""
+    monkeypatch.setattr(
+        contract, "_REGISTRY", {name: registered()[name] for name in ("position_prior", "point_on_plane")}
+    )
+
+
+def test_selfcheck(two_factors, capsys):
     assert run(["selfcheck", "--json", "-"]) == 0
     said = capsys.readouterr()
     report = json.loads(said.out)
@@ -134,6 +143,6 @@ def test_selfcheck(capsys):
 
 
 @pytest.mark.shared
-def test_selfcheck_against_reference_values(shared_golden, capsys):
+def test_selfcheck_against_reference_values(two_factors, shared_golden, capsys):
     assert run(["selfcheck", "--golden", str(shared_golden)]) == 0
     assert "golden" in capsys.readouterr().out

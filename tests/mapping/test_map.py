@@ -207,6 +207,7 @@ def test_line_matches_from_a_file_through_the_command(tmp_path, corner, monkeypa
 
 
 # ------------------------------------------------------------------------------------------------------------ real data
+@pytest.mark.slow
 @pytest.mark.shared
 def test_church_front(shared_data, tmp_path, monkeypatch):
     """More lines than LIMAP finds there (242, 169 of them in four images), and poses no worse than the model's."""

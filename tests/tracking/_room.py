@@ -21,7 +21,7 @@ def camera(baseline: float | None = None) -> SequenceCamera:
 
 @cache
 def _paintings() -> np.ndarray:
-    """Six walls (6, n, n): soft noise, and dark and bright rectangles with sharp edges."""
+    """Six walls, one below the other (6 n, n): soft noise, and dark and bright rectangles with sharp edges."""
     rng = np.random.default_rng(7)
     size = int(2 * ROOM.max() * TEXELS) + 2
     walls = np.empty((6, size, size), np.float32)
@@ -33,7 +33,7 @@ def _paintings() -> np.ndarray:
             w, h = rng.integers(20, 110, 2)
             wall[v : v + h, u : u + w] += rng.choice([-55, 55])
         cv2.GaussianBlur(wall, (0, 0), 1.0, dst=wall)
-    return np.clip(walls, 5, 250)
+    return np.clip(walls, 5, 250).reshape(-1, size)
 
 
 def render(cam_from_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -48,22 +48,20 @@ def _rendered(pose: bytes) -> tuple[np.ndarray, np.ndarray]:
     world = se3.inverse(cam_from_world[None])[0]
     R = quaternion.to_matrix(world[:4])
     v, u = np.mgrid[0:HEIGHT, 0:WIDTH]
-    rays = np.stack([(u + 0.5 - WIDTH / 2) / FOCAL, (v + 0.5 - HEIGHT / 2) / FOCAL, np.ones(u.shape)], axis=-1)
-    along = rays @ R.T
+    x, y = (u + 0.5 - WIDTH / 2) / FOCAL, (v + 0.5 - HEIGHT / 2) / FOCAL
+    along = [row[0] * x + row[1] * y + row[2] for row in R]
     with np.errstate(divide="ignore"):
-        distance = np.where(along > 0, (ROOM - world[4:]) / along, (-ROOM - world[4:]) / along)
-    axis = distance.argmin(axis=-1)
-    depth = np.take_along_axis(distance, axis[..., None], axis=-1)[..., 0]
-    place = world[4:] + depth[..., None] * along
-    side = np.take_along_axis(along, axis[..., None], axis=-1)[..., 0] > 0
-    first, second = np.where(axis == 0, 1, 0), np.where(axis == 2, 1, 2)
-    s = (np.take_along_axis(place, first[..., None], -1)[..., 0] + ROOM.max()) * TEXELS
-    t = (np.take_along_axis(place, second[..., None], -1)[..., 0] + ROOM.max()) * TEXELS
-    gray = np.zeros(u.shape, np.float32)
-    for wall in range(6):
-        mine = (2 * axis + side) == wall
-        painted = cv2.remap(_paintings()[wall], s.astype(np.float32), t.astype(np.float32), cv2.INTER_LINEAR)
-        gray[mine] = painted[mine]
+        distance = [(np.copysign(ROOM[k], along[k]) - world[4 + k]) / along[k] for k in range(3)]
+    depth = np.minimum(np.minimum(distance[0], distance[1]), distance[2])
+    is_x, is_z = depth == distance[0], depth == distance[2]
+    place = [world[4 + k] + depth * along[k] for k in range(3)]
+    is_far = np.where(is_x, along[0], np.where(is_z, along[2], along[1])) > 0
+    wall = 2 * np.where(is_x, 0, np.where(is_z, 2, 1)) + is_far
+    s = (np.where(is_x, place[1], place[0]) + ROOM.max()) * TEXELS
+    t = (np.where(is_z, place[1], place[2]) + ROOM.max()) * TEXELS
+    walls = _paintings()
+    below = t + wall * walls.shape[1]
+    gray = cv2.remap(walls, s.astype(np.float32), below.astype(np.float32), cv2.INTER_LINEAR)
     return np.round(gray).astype(np.uint8), depth.astype(np.float32)
 
 

@@ -267,7 +267,7 @@ def _turned_frames(turn, truth):
 
 def test_a_track_with_a_turned_right_camera():
     """Of 0.1, 0.2 and -0.15 degrees: the track begins anew as soon as motion tells yaw, and keeps what it found."""
-    turn, truth = np.radians([0.1, 0.2, -0.15]), _room.poses(60)
+    turn, truth = np.radians([0.1, 0.2, -0.15]), _room.poses(36)
     frames = _turned_frames(turn, truth)
     tracker, better, count = Tracker(_room.camera(_room.BASELINE)), None, 0
     while better is None and count < 30:

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Real sequences: limits are those the tracker was made for, on references of a depth camera, a laboratory and GPS."""
+"""Real sequences: limits are those the tracker was made for, on references of a depth camera, a laboratory and GPS.
+
+Whole sequences are slow tests where the same one is tracked with frames left out, which is harder.
+"""
 
 import cv2
 import numpy as np
@@ -27,9 +30,10 @@ def test_kitchen_with_frames_left_out(shared_data, stride):
 @pytest.mark.parametrize("stride", [SECOND, 3])
 def test_cabinet_with_frames_left_out(shared_data, stride):
     """Up to 30 degrees from frame to frame, with few points."""
-    statuses, _, scores = _track(shared_data / "rgbd_tum_fr3_cabinet", stride=stride)
+    statuses, result, scores = _track(shared_data / "rgbd_tum_fr3_cabinet", stride=stride)
     assert set(statuses) == {"tracked"}
     assert scores.ate.rmse < 0.03
+    _assert_photographs(result.scene, shared_data / "rgbd_tum_fr3_cabinet")
 
 
 def test_a_cabinet_seen_again_from_the_opposite_side_is_not_found(shared_data):
@@ -61,6 +65,7 @@ def _track(folder, align: Alignment = "se3", options=None, **selection):
     return statuses, result, score_trajectory(result.trajectory, frames.reference, align, max_time_difference=0.02)
 
 
+@pytest.mark.slow
 def test_kitchen(shared_data):
     statuses, result, scores = _track(shared_data / "rgbd_7scenes_redkitchen")
     assert set(statuses) == {"tracked"}
@@ -68,6 +73,7 @@ def test_kitchen(shared_data):
     assert result.scene.num_lines > 30
 
 
+@pytest.mark.slow
 def test_cabinet_needs_lines_and_planes(shared_data):
     """Few points, wide steps: 3 cm over a path of 8.3 m with all landmarks; points alone are farther off."""
     statuses, result, scores = _track(shared_data / "rgbd_tum_fr3_cabinet")
@@ -125,6 +131,7 @@ def _ground_below(scene):
     return float(np.median(height)), float(upright)
 
 
+@pytest.mark.slow
 def test_street_by_one_camera(shared_data):
     statuses, result, scores = _track(shared_data / "stereo_kitti06", "sim3", kind="mono")
     assert "lost" not in statuses
