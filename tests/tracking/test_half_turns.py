@@ -13,6 +13,8 @@ WIDTH, HEIGHT, FOCAL = 320, 240, 260.0
 CAMERA = SequenceCamera("PINHOLE", np.array([FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]), WIDTH, HEIGHT)
 #: Boxes from corner to corner; y points down, the floor is at 0. The first one is painted alike on opposite sides.
 BOX, BESIDE = ((-0.5, -0.6, -0.3), (0.5, 0.0, 0.3)), ((0.6, -1.0, -0.5), (1.4, 0.0, 0.5))
+#: Seen from the other side as well: there a tenth of what is in view would be seen through.
+POST = ((0.6, -1.0, -0.3), (0.8, 0.0, -0.1))
 GREY = np.random.default_rng(3).integers(40, 220, 4096)
 
 
@@ -29,8 +31,11 @@ def test_half_turns_move_the_world_and_keep_the_axis():
 
 @pytest.mark.parametrize(
     ("boxes", "angle", "status"),
-    [([BOX], 180.0, "lost"), ([BOX], 0.0, "lost"), ([BOX, BESIDE], 0.0, "tracked"), ([BOX, BESIDE], 180.0, "lost")],
-)
+    [
+        ([BOX], 180.0, "lost"), ([BOX], 0.0, "lost"), ([BOX, BESIDE], 0.0, "tracked"), ([BOX, BESIDE], 180.0, "lost"),
+        ([BOX, POST], 0.0, "tracked"), ([BOX, POST], 180.0, "lost"),
+    ],
+)  # fmt: skip
 def test_after_a_gap_the_other_side_is_told_by_depth_alone(boxes, angle, status):
     tracker = Tracker(CAMERA, TrackOptions(threaded=False))
     statuses = [tracker.process(_frame(boxes, 3.0 * k, 0.1 * k)).status for k in range(4)]

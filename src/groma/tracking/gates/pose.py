@@ -46,6 +46,7 @@ class DepthCheckGates:
     min_places: int = gate(40, "places", "places that must be known", SEQUENCES)
     confirms: float = gate(0.8, "share", "this share of the places confirms a pose", SEQUENCES)
     denies: float = gate(0.35, "share", "this share of the places seen through denies it", SEQUENCES)
+    edges: float = gate(0.07, "share", "a right pose may look through at edges", "chosen on cabinet and kitchen")
     smooth: float = gate(0.15, "share", "depths are read where four neighbours differ by less", SEQUENCES)
 
 

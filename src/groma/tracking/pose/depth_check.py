@@ -45,20 +45,52 @@ def depth_agreement(
         Share of the places in view that are measured where they are, and share that the frame looks through (it
         measures something farther away). The rest is hidden. Both NaN where too few are known.
     """
-    check = gates.depth_check
+    away, tolerance, _ = _compared(camera, keyframes, grid, pose, gates)
+    if len(away) < gates.depth_check.min_places:
+        return np.nan, np.nan
+    return float((np.abs(away) < tolerance).mean()), float((away > tolerance).mean())
+
+
+def left_open(
+    camera: TrackCamera,
+    keyframes: Sequence[Keyframe],
+    grid: FloatArray,
+    pose: FloatArray,
+    gates: TrackingGates = DEFAULT,
+) -> bool:
+    """Return whether depths of a frame leave open that a pose is right: some agree, few are beyond what keyframes know.
+
+    At the right pose a frame looks through a place at edges, and as seldom as noise exceeds the tolerance. Counted are
+    cells of the frame's grid, since places in one are measured once. Parameters are those of :func:`depth_agreement`;
+    False where too few depths are known.
+    """
+    from scipy.special import gammainc
+
+    away, tolerance, pixel = _compared(camera, keyframes, grid, pose, gates)
+    if len(away) < gates.depth_check.min_places:
+        return False
+    through, there = (_num_cells(pixel[some], gates.depth.grid) for some in (away > tolerance, away > -tolerance))
+    by_noise = float(gammainc(through, NORMAL.outlier * there)) if there else 1.0  # so many or more, Poisson
+    return there > through and (through <= gates.depth_check.edges * there or by_noise > NORMAL.gross)
+
+
+def _num_cells(pixel: FloatArray, size: int) -> int:
+    """Number of cells of a grid that pixels are in."""
+    return len(np.unique(np.floor(pixel / size), axis=0))
+
+
+def _compared(camera: TrackCamera, keyframes, grid: FloatArray, pose: FloatArray, gates: TrackingGates):
+    """How far beyond the places of keyframes a frame measures, (n,), with tolerances (n,) and pixels (n, 2)."""
     rays = camera.bearings(grid_pixels(camera, gates.depth))
     places = [back(k.pose, (rays * k.depth_grid[:, None])[np.isfinite(k.depth_grid)]) for k in keyframes]
     in_cam = into(pose, np.concatenate(places))
     pixel = camera.project(in_cam)
-    rows = camera.inside(pixel)
-    measured, expected = _read(camera, grid, pixel[rows], gates), in_cam[rows, 2]
+    rows = np.flatnonzero(camera.inside(pixel))
+    measured = _read(camera, grid, pixel[rows], gates)
     known = np.isfinite(measured)
-    if known.sum() < check.min_places:
-        return np.nan, np.nan
-    measured, expected = measured[known], expected[known]
+    rows, measured = rows[known], measured[known]
     tolerance = DEPTH_POINTS.jump_share * measured + NORMAL.far * depth_sigma(measured, gates.depth)
-    away = measured - expected
-    return float((np.abs(away) < tolerance).mean()), float((away > tolerance).mean())
+    return measured - in_cam[rows, 2], tolerance, pixel[rows]
 
 
 def _read(camera: TrackCamera, grid: FloatArray, pixel: FloatArray, gates: TrackingGates) -> FloatArray:

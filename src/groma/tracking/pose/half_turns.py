@@ -4,7 +4,8 @@
 Boxes look the same from opposite sides, in points, lines and planes, and the side where the camera is need not be in
 the map: what agrees with the pose that was found says nothing then. What the map knows can deny the other pose alone.
 So poses are turned by half about each plane in view, at the middle of what was seen of it, and estimated again. Where
-planes agree with such a pose and depth does not look through what the map knows, it is left open which one is right.
+planes agree with such a pose and depth looks through what the map knows no more often than noise and edges explain, it
+is left open which one is right. Points do not tell: what floors and tables show is not recognised from the other side.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from groma.geometry import quaternion, se3
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.features import FrameFeatures
 from groma.tracking.map.track_map import Keyframe, TrackMap
-from groma.tracking.pose.depth_check import depth_agreement
+from groma.tracking.pose.depth_check import left_open
 from groma.tracking.pose.relocalise import Found, PoseSearch, match_planes
 
 
@@ -37,15 +38,14 @@ def poses_left_open(
     sigma : (6,)
         Standard deviations by which a turned pose may be off: translation (scene units), rotation (radians).
     """
-    out, pose, planes, gates = [], found.estimate.pose, track_map.planes, data.options.gates
+    out, pose, planes = [], found.estimate.pose, track_map.planes
     for index in match_planes(track_map, data, pose).index:
         start = turned_by_half(pose, planes.hesse[index, :3], np.nanmean(planes.samples[index], axis=0))
         other = PoseSearch(track_map, camera, data, found.known, start, sigma).refine(start)
         # Two planes that cross hold a pose upright; along one of them anything can be seen.
         if other is None or other.estimate.counts["planes"] < 2:
             continue
-        agree, through = depth_agreement(camera, keyframes, data.depth_grid, other.estimate.pose, gates)
-        if agree > gates.depth_check.confirms * (agree + through):
+        if left_open(camera, keyframes, data.depth_grid, other.estimate.pose, data.options.gates):
             out.append(other.estimate.pose)
     return out
 
