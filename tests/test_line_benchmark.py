@@ -70,4 +70,5 @@ def test_the_cabinet_is_scored_for_the_table_of_detectors(lines):
     """Its start has no lines: none of twelve edges is found, and nothing fails."""
     detectors = importlib.import_module("detectors")
     start = detectors.read_scene(detectors.folder() / "model")
-    assert detectors.compared(lines.LineScene("cabinet", start, []), start) == {"lines": 0, "found": [0.0], "right": [0.0]}
+    row = detectors.compared(lines.LineScene("cabinet", start, []), start)
+    assert row == {"lines": 0, "found": [0.0], "right": [0.0]}
