@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Which calibration a query begins with: that of the map, what its file says, or none."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from PIL import Image
 
+from groma.errors import InputError
+from groma.localization import run
 from groma.localization.calibration import CalibrationChoice, calibration_of
+from groma.localization.localizer import Localizer
 from groma.localization.pose.camera import QueryCamera
 
 SIZE = (64, 48)
@@ -38,3 +43,32 @@ def test_what_a_file_tells_is_compared_with_what_files_of_the_map_tell(tmp_path,
     assert (found.camera is OF_MAP, found.refine) == (is_that_of_the_map, not is_that_of_the_map)
     if not is_that_of_the_map:
         assert found.camera.params[0] == pytest.approx(own / np.hypot(36, 24) * np.hypot(*SIZE), rel=1e-3)
+
+
+class _Map:
+    """Two photographs of two sizes; it tells with which camera a query is looked for."""
+
+    scene = SimpleNamespace(
+        cameras=SimpleNamespace(width=np.array([80, 64]), height=np.array([48, 48])),
+        images=SimpleNamespace(camera_idx=np.array([0, 1])),
+    )
+
+    def __init__(self, files):
+        self.files, self.asked = files, []
+
+    photograph_of_map = Localizer.photograph_of_map
+
+    def camera_of_map(self, *size):
+        return OF_MAP
+
+    def localize(self, image, camera, refine):
+        self.asked.append((camera, refine))
+        raise InputError("That is enough.")
+
+
+def test_a_query_is_compared_with_a_photograph_of_its_size(tmp_path):
+    files = [_photograph(tmp_path / "other.jpg", 54), _photograph(tmp_path / "same.jpg", 24)]
+    map_ = _Map(files)
+    assert Localizer.photograph_of_map(map_, 10, 10) is None
+    run._localize(map_, "query.jpg", _photograph(tmp_path / "query.jpg", 24), CalibrationChoice())
+    assert map_.asked == [(OF_MAP, False)]
