@@ -118,9 +118,7 @@ def _joined(
     return _with_wholes(planes, groups, wholes)
 
 
-def _beside(
-    marks: Landmarks, planes: PlaneSet, points: Pairs, lines: Pairs, first: int, free: np.ndarray
-) -> list[int]:
+def _beside(marks: Landmarks, planes: PlaneSet, points: Pairs, lines: Pairs, first: int, free: np.ndarray) -> list[int]:
     """A plane, then those in its layer that are connected with it, directly or by others of them."""
     plane = planes.planes[first]
     turned = np.arccos(np.clip(np.abs(planes.planes[:, :3] @ plane[:3]), 0.0, 1.0))
