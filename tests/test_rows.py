@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from groma._rows import Rows
+from groma._rows import Rows, pointers_of
 from groma.tracking.frame.measurements import LineMeasurements, PlaneMeasurements, PointMeasurements
 from groma.tracking.map.lines import FollowedSegments
 
@@ -39,3 +39,9 @@ def test_every_table_of_measurements_can_be_empty():
         [(0,), (0, 4), (0,), (0, 2), (0, 2)],
         [(0,), (0, 4), (0, 3, 3)],
     ]
+
+
+def test_pointers_of_groups_are_whole_numbers_also_without_groups():
+    np.testing.assert_array_equal(pointers_of([2, 0, 3]), [0, 2, 2, 5])
+    np.testing.assert_array_equal(pointers_of(np.array([True, False])), [0, 1, 1])
+    assert pointers_of([]).tolist() == [0] and pointers_of([]).dtype == np.int64

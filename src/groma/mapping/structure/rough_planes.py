@@ -118,22 +118,14 @@ def _joined(
     return _with_wholes(planes, groups, wholes)
 
 
-def _beside(
-    marks: Landmarks,
-    planes: PlaneSet,
-    points: Pairs,
-    lines: Pairs,
-    first: int,
-    free: np.ndarray,
-    gates: RelationGates = _RELATIONS,
-) -> list[int]:
+def _beside(marks: Landmarks, planes: PlaneSet, points: Pairs, lines: Pairs, first: int, free: np.ndarray) -> list[int]:
     """A plane, then those in its layer that are connected with it, directly or by others of them."""
     plane = planes.planes[first]
     turned = np.arccos(np.clip(np.abs(planes.planes[:, :3] @ plane[:3]), 0.0, 1.0))
     near = [
         b
-        for b in np.flatnonzero(free & (turned < gates.competing)).tolist()
-        if np.median(np.abs(planes.places[b] @ plane[:3] + plane[3])) < gates.layer * planes.band[first]
+        for b in np.flatnonzero(free & (turned < _RELATIONS.competing)).tolist()
+        if np.median(np.abs(planes.places[b] @ plane[:3] + plane[3])) < _RELATIONS.layer * planes.band[first]
     ]
     group, reached = [first], [first]
     while reached:
