@@ -19,7 +19,7 @@ def numbered(count: IntArray) -> tuple[IntArray, IntArray]:
     return owner, np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
 
 
-def pointers_of(count: npt.ArrayLike) -> IntArray:
+def pointers_of(count: npt.ArrayLike) -> npt.NDArray[np.int64]:
     """Return where each of several groups of ``count`` items begins, and where the last one ends, (groups + 1,)."""
     return np.concatenate([[0], np.cumsum(count, dtype=np.int64)])
 
