@@ -139,7 +139,7 @@ ROOMS: Rooms = (
 
 HEAD = """# Supported names
 
-These names keep their meaning; a rename leaves a message that tells the new name. What is not on this page, public or
+These names keep their meaning; a rename leaves a message with the new name. What is not on this page, public or
 not, may change without notice. The page is written from the code (`python docs/_supported_names.py`), and a test
 compares them.
 """

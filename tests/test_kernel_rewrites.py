@@ -50,6 +50,7 @@ def _steps_of(function, arguments, monkeypatch):
         monkeypatch.setattr(
             step, "run_pass", lambda self, state, step=step, before=before: taken.append(step) or before(self, state)
         )
+    assert function._cache.cache_path  # opened, else the methods of what stands for it would be replaced
     monkeypatch.setattr(function._cache, "load_overload", lambda *_: None)
     monkeypatch.setattr(function._cache, "save_overload", lambda *_: None)
     found = function(*arguments)

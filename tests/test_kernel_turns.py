@@ -6,9 +6,11 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numba
 import pytest
+from numba.core.registry import cpu_target
 
 from groma._kernels import inner as kernel_inner
 from groma._kernels import turns as kernel_turns
@@ -102,9 +104,28 @@ def test_what_does_not_compile_keeps_no_turn(tmp_path, monkeypatch):
         return x.nothing_of_this_name
 
     given = []
-    monkeypatch.setattr(kernel_turns, "give_back", lambda folder, name: given.append(name))
+    monkeypatch.setattr(kernel_turns, "give_back", lambda _, name: given.append(name))
     compiled = loop(wrong)
     with pytest.raises(numba.TypingError):
         compiled(1.0)
     assert len(given) == 1
     assert not kernel_inner.is_inside()
+    monkeypatch.undo()
+    kernel_turns.give_back(Path(compiled._cache.cache_path), given[0])
+
+
+def test_functions_of_one_file_with_the_same_arguments_have_turns_of_their_own():
+    from groma.compiled import loop
+
+    @loop
+    def once(x):
+        return x
+
+    @loop
+    def twice(x):
+        return 2.0 * x
+
+    target = cpu_target.target_context
+    keys = [function._cache._index_key((numba.float64,), target.codegen()) for function in (once, twice)]
+    assert keys[0].name == keys[1].name
+    assert once._cache._turn(keys[0]) != twice._cache._turn(keys[1])

@@ -216,9 +216,9 @@ def test_matrix_file(tum):
         ("1 PINHOLE 640 480 500 500 320 240", "for images of"),
         ("-50 51 32 24", "positive"),
         ("missing.txt", "Cannot read"),
-        ("PINHOLE 64 48 a 51 32 24", "not a camera"),
-        ("PINHOLE wide 48 50 51 32 24", "not a camera"),
-        ([50, [51], 32, 24], "not a camera"),
+        ("PINHOLE 64 48 a 51 32 24", "cannot be read as a calibration"),
+        ("PINHOLE wide 48 50 51 32 24", "cannot be read as a calibration"),
+        ([50, [51], 32, 24], "cannot be read as a calibration"),
     ],
 )
 def test_cameras_that_are_refused(tum, camera, words):

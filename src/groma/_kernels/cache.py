@@ -219,8 +219,8 @@ class _Cache(FunctionCache):
         stem = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}-{python}"
         self._stem = stem.replace("<", "").replace(">", "")
         self._cache_file = _Files(self.cache_path, self._stem)
-        #: Names of what is being compiled, one inside the other; None where nothing is kept.
-        self._turns: list[str | None] = []
+        #: Turns of what is being compiled, one inside the other; None where nothing is kept.
+        self._turns: list[tuple[Path, str] | None] = []
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
         """Return a key; None where functions or objects are arguments, whose types hold for this process only."""
@@ -240,7 +240,7 @@ class _Cache(FunctionCache):
     def take_turn(self, sig: Any, target_context: Any) -> bool:
         """Take the turn to compile the function; False if it is there or another process has the turn."""
         key = self._index_key(sig, target_context.codegen())
-        return key is not None and not self._cache_file.has(key) and kernel_turns.take(Path(self.cache_path), key.name)
+        return key is not None and not self._cache_file.has(key) and kernel_turns.take(*self._turn(key))
 
     def is_kept(self, sig: Any, target_context: Any) -> bool:
         """Whether the function lies on disk, so that it need only be loaded."""
@@ -262,7 +262,7 @@ class _Cache(FunctionCache):
             key = self._index_key(sig, target_context.codegen()) if self._enabled else None
             data = self._find(key, sig)
             if data is None:
-                self._turns.append(None if key is None else key.name)
+                self._turns.append(None if key is None else self._turn(key))
                 return None
             if key is not None:
                 self._note(self._cache_file.path(key), sig)
@@ -272,8 +272,7 @@ class _Cache(FunctionCache):
         """Return what was compiled, by this process or another; or take the turn to compile it, and return None."""
         if key is None:
             return None
-        data = self._cache_file.load(key)
-        if data is None:
+        if (data := self._cache_file.load(key)) is None:
             data = self._from_shipped(sig, _Files.load)
         if data is not None:
             return data
@@ -281,12 +280,15 @@ class _Cache(FunctionCache):
             counts.missed += 1
             for call in on_miss:
                 call(counts)
-        folder = Path(self.cache_path)
-        kernel_turns.wait(folder, key.name, lambda: self._cache_file.has(key))
-        data = self._cache_file.load(key)
-        if data is not None:
-            kernel_turns.give_back(folder, key.name)
+        turn = self._turn(key)
+        kernel_turns.wait(*turn, lambda: self._cache_file.has(key))
+        if (data := self._cache_file.load(key)) is not None:
+            kernel_turns.give_back(*turn)
         return data
+
+    def _turn(self, key: _Key) -> tuple[Path, str]:
+        """Return folder and name of the turn to compile the function; a key may be that of another function, too."""
+        return Path(self.cache_path), _digest((self._stem, key.name))
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Save; a full disk, or a folder that became read-only, costs time in the next process and nothing else."""
@@ -302,8 +304,8 @@ class _Cache(FunctionCache):
 
     def end_turn(self) -> None:
         """Let other processes compile what this one has compiled, or could not compile."""
-        if self._turns and (name := self._turns.pop()) is not None:
-            kernel_turns.give_back(Path(self.cache_path), name)
+        if self._turns and (turn := self._turns.pop()) is not None:
+            kernel_turns.give_back(*turn)
 
     def _note(self, path: Path, sig: Any) -> None:
         if kernel_inner.is_inside():

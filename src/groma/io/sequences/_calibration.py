@@ -232,7 +232,7 @@ def from_opencv(numbers: npt.ArrayLike, size: tuple[int, int] | None = None) -> 
     try:
         array = np.asarray(numbers, np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"camera is not a camera ({error}); {_HELP}.") from error
+        raise InputError(f"camera cannot be read as a calibration ({error}); {_HELP}.") from error
     calibration = _from_numbers(array[[0, 1, 0, 1], [0, 1, 2, 2]] if array.shape == (3, 3) else array, "camera")
     return Calibration(calibration.model, calibration.params, size)
 
@@ -242,7 +242,7 @@ def _from_text(text: str, source: str) -> Calibration:
     lines = [words for words in lines if words]
     if not lines:
         raise FileFormatError(f"{source} holds no camera; {_HELP}.")
-    wrong = f"{source} is not a camera"
+    wrong = f"{source} cannot be read as a calibration"
     for skip in (0, 1):  # with or without the number of the camera
         words = lines[0][skip:]
         if len(words) > 3 and words[0][:1].isalpha():
