@@ -64,16 +64,18 @@ def finite(words: Iterable[str], place: object, expected: str = "finite numbers"
     except ValueError:
         found = [math.nan]
     if not all(map(math.isfinite, found)):
-        wrong = next(word for word in words if not _is_finite(word))
+        wrong = next(word for word in words if not (is_number(word) and math.isfinite(float(word))))
         raise FileFormatError(f"{place}: expected {expected}; got {shown(wrong)}. Correct the file.")
     return found
 
 
-def _is_finite(word: str) -> bool:
+def is_number(word: str) -> bool:
+    """Whether a word is a number for Python, NaN and infinity included."""
     try:
-        return math.isfinite(float(word))
+        float(word)
     except ValueError:
         return False
+    return True
 
 
 def whole(word: str, place: object, expected: str = "a whole number") -> int:

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from groma import cameras
 from groma._typing import FloatArray, IntArray
 from groma.bounded.documents import member, number, of_kind, read_document, size, table
-from groma.bounded.text import finite, read_text, whole
+from groma.bounded.text import finite, is_number, read_text, whole
 from groma.errors import FileFormatError, InputError
 from groma.io.reading import reading
 from groma.io.sequences._yaml import yaml_entries, yaml_numbers
@@ -131,17 +131,9 @@ def calibration_of(camera: CameraLike) -> Calibration:
     text = os.fspath(camera)
     words = text.replace(",", " ").split()
     # Path.is_file fails where a text is too long for a name.
-    if isinstance(camera, str) and not os.path.isfile(camera) and (len(words) >= 4 or all(map(_is_number, words))):
+    if isinstance(camera, str) and not os.path.isfile(camera) and (len(words) >= 4 or all(map(is_number, words))):
         return _from_text(camera, "camera")
     return read_calibration(Path(text))
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def read_calibration(path: Path) -> Calibration:

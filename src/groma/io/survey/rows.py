@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.bounded.text import finite, read_lines, shown
+from groma.bounded.text import finite, is_number, read_lines, shown
 from groma.errors import FileFormatError
 from groma.io.reading import existing, reading
 from groma.io.survey.positions import split
@@ -189,9 +189,9 @@ def read_measured_poses(path: str | os.PathLike[str]) -> PosesFile:
 def is_measured_poses(line: str) -> bool:
     """Tell from the first line of a file whether it holds poses by name, as :func:`read_measured_poses` reads them."""
     words = split(line)
-    if len(words) not in (8, 10, 29, 44) or _is_number(words[0]):
+    if len(words) not in (8, 10, 29, 44) or is_number(words[0]):
         return False
-    return words[0].lower() == "name" or all(map(_is_number, words[1:]))
+    return words[0].lower() == "name" or all(map(is_number, words[1:]))
 
 
 def _covariance(numbers: list[float], where: str) -> FloatArray:
@@ -245,17 +245,9 @@ def _rows(
             if len(words) not in lengths:
                 raise FileFormatError(f"{where}: expected {expected}; got {shown(line)}.")
             named = words[0].lower() in ("name", "image", "object")
-            if row == 0 and (named or (number is not None and not _is_number(words[number]))):
+            if row == 0 and (named or (number is not None and not is_number(words[number]))):
                 continue
             count += 1
             yield where, words
     if not count:
         raise FileFormatError(f"{place} is a {kind} with nothing in it. Expected lines of {expected}.")
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True

@@ -79,7 +79,9 @@ def _num_cells(pixel: FloatArray, size: int) -> int:
     return len(np.unique(np.floor(pixel / size), axis=0))
 
 
-def _compared(camera: TrackCamera, keyframes, grid: FloatArray, pose: FloatArray, gates: TrackingGates):
+def _compared(
+    camera: TrackCamera, keyframes: Sequence[Keyframe], grid: FloatArray, pose: FloatArray, gates: TrackingGates
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """How far beyond the places of keyframes a frame measures, (n,), with tolerances (n,) and pixels (n, 2)."""
     rays = camera.bearings(grid_pixels(camera, gates.depth))
     places = [back(k.pose, (rays * k.depth_grid[:, None])[np.isfinite(k.depth_grid)]) for k in keyframes]
