@@ -115,8 +115,13 @@ def _break_message(error: Any) -> None:
         error.format_message = lambda: message
 
 
-#: Typer's messages about invalid values, and those of groma.
+#: Typer's messages about invalid values, before and since 0.29, and those of groma.
 _PLAIN = (
+    (r".* is not a valid int.*", "must be a whole number."),
+    (r".* is not a valid float.*", "must be a number."),
+    (r".* is not in the range \w>=(\S+)\.", r"must be \1 or more."),
+    (r".* is not in the range \w<=(\S+)\.", r"must be \1 or less."),
+    (r".* is not in the range (\S+)<=\w<=(\S+)\.", r"must be from \1 to \2."),
     (r"Value error, ", ""),
     (r"Input should be a valid integer.*", "must be a whole number."),
     (r"Input should be a valid number.*", "must be a number."),
