@@ -20,8 +20,9 @@ from groma.adjustment.survey.gross_errors import reliability_of, without_gross_e
 from groma.adjustment.survey.records import Reliability
 from groma.io.survey import WorldFrame
 from groma.mapping.checkpoint_files import SCENE
-from groma.mapping.checkpoints import stage
+from groma.mapping.checkpoints import Stages, stage
 from groma.mapping.noise.weighted import adjust_weighted, weighted
+from groma.mapping.point_base import PointBase
 from groma.scene import Scene, Similarity
 from groma.scene.checks import check_scene_given
 from groma.scene.local_frame import usual_frame
@@ -97,26 +98,16 @@ def adjust_surveyed(
     return SurveyedResult(result, surveyed, found, motions)
 
 
-@dataclass(frozen=True, eq=False)
-class Tied:
-    """A map on its way, in the frame of measurements."""
-
-    surveyed: Surveyed
-    #: The scene that went in, and the points with the measurements, both near the origin and in a usual unit.
-    start: Scene
-    points: Scene
-    #: What brought them there from the frame of the measurements; None where nothing did.
-    near: Similarity | None
-
-
-def tied(start: Scene, points: Scene, survey: Survey) -> Tied:
-    """Bring the points of a map into the frame of measurements, and add these."""
-    surveyed = with_survey(points, survey)
+def with_measurements(base: PointBase, survey: Survey, stages: Stages[Any]) -> PointBase:
+    """Bring the points of a map into the frame of measurements, and adjust them with these."""
+    surveyed = with_survey(base.points, survey)
     near = usual_frame(surveyed.scene)
-    start, points = start.transformed(surveyed.similarity), surveyed.scene
+    start, points = base.start.transformed(surveyed.similarity), surveyed.scene
     if near is not None:
         start, points = start.transformed(near), points.transformed(near)
-    return Tied(surveyed, start, points, near)
+    return replace(
+        base, start=start, near=near, points=stages.run(adjust_with_survey, points, given=points), surveyed=surveyed
+    )
 
 
 @stage("surveyed", SCENE, lambda options: options.keep_suspects)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -18,42 +18,28 @@ from groma.mapping.checkpoints import Stages, digest, digest_files, stage
 from groma.mapping.depth.points import MeasuredDepths, check_cameras, measure_depths
 from groma.mapping.depth.segments import segment_depths
 from groma.mapping.noise.observations import noise_px
+from groma.mapping.point_base import PointBase
 from groma.scene import Scene, Similarity
 
 _Say = Callable[[str, int, int], None]
 
 
-@dataclass(frozen=True, eq=False)
-class WithDepths:
-    """A map on its way, in the unit of length of depth maps."""
-
-    #: The scene that went in, and the points adjusted with their depths.
-    start: Scene
-    points: Scene
-    #: From the frame of the result to theirs; None: they are the same.
-    near: Similarity | None
-    measured: MeasuredDepths
-
-
-def with_depths(
-    start: Scene, points: Scene, near: Similarity | None, maps: DepthMaps, stages: Stages[Any]
-) -> WithDepths:
+def with_depths(base: PointBase, maps: DepthMaps, stages: Stages[Any]) -> PointBase:
     """Bring a model of points to the unit of depth maps, and adjust it with the depths of its points."""
-    check_cameras(points)
-    files = [file for file in maps.files(points.images.names) if file is not None]
+    check_cameras(base.points)
+    files = [file for file in maps.files(base.points.images.names) if file is not None]
     given = digest(digest_files(maps.folder, files), maps.scale, maps.relative)
-    before = near or Similarity()
-    known = before.scale if points.has_scale else None
-    measured = stages.run(find_depths, points, maps, known, given=given)
+    before = base.near or Similarity()
+    known = before.scale if base.points.has_scale else None
+    measured = stages.run(find_depths, base.points, maps, known, given=given)
     adjusted = stages.run(adjust_with_depths, measured.scene)
-    scale = measured.scale
-    start = start.transformed(Similarity(scale)) if scale != 1.0 else start
+    scale, near = measured.scale, None
+    start = base.start.transformed(Similarity(scale)) if scale != 1.0 else base.start
     if maps.relative:  # back to the unit of the model at the end
-        after = Similarity(scale * before.scale, before.rotation, scale * before.translation)
-    else:
-        after = Similarity(1.0 if known is None else before.scale, before.rotation, scale * before.translation)
-    same = near is None and not maps.relative
-    return WithDepths(start, adjusted, None if same else after, measured)
+        near = Similarity(scale * before.scale, before.rotation, scale * before.translation)
+    elif base.near is not None:
+        near = Similarity(1.0 if known is None else before.scale, before.rotation, scale * before.translation)
+    return replace(base, start=start, near=near, points=adjusted, depths=measured)
 
 
 @stage("depths", DEPTHS)
