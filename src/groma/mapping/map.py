@@ -52,7 +52,6 @@ from groma.mapping.carried.measured import (
 from groma.mapping.checkpoint_files import ADJUSTED, LINE_MAP, SCENE, SEGMENTS
 from groma.mapping.checkpoints import Stages, digest, digest_files, stage
 from groma.mapping.depth.segments import with_line_depths
-from groma.mapping.depth.stages import find_segment_depths, with_depths
 from groma.mapping.exchange import NeighborChooser, matches_for, neighbors_for, with_parts
 from groma.mapping.image_segments import detect_segments, given_segments
 from groma.mapping.lines.hypotheses.earlier import GATES as EARLIER
@@ -64,14 +63,13 @@ from groma.mapping.noise.observations import line_bend, line_end_correlation, mo
 from groma.mapping.noise.shared import with_shared_noise
 from groma.mapping.options import MapOptions, StageProgress
 from groma.mapping.photographs import checked_photographs, image_files, image_reader, photographs_left_out
-from groma.mapping.point_base import PointBase
+from groma.mapping.point_base import PointBase, find_segment_depths, with_depths, with_measurements
 from groma.mapping.read_rows import adjust_read_rows, mapped_as_measured, read_by_rows, taken_at_once
 from groma.mapping.refine_points import refine_points
 from groma.mapping.result import SCENES_OF_RESULT, MapResult, result_of
 from groma.mapping.start import start_of
 from groma.mapping.structure.find import LandmarkNoise, detect_structure, landmark_noise
 from groma.mapping.structure.flatness import surface_noise_px, with_rough_planes
-from groma.mapping.surveyed import with_measurements
 from groma.scene import Scene, Similarity
 from groma.scene.local_frame import usual_frame
 from groma.solver.linear.blas import one_blas_thread
