@@ -12,6 +12,11 @@ def counted(count: int, plural: str) -> str:
     return f"{count:,} {plural.removesuffix('s') if count == 1 else plural}"
 
 
+def whole_percent(share: float) -> str:
+    """Return a share in whole percents, or that it is less than half a one."""
+    return "under 1 %" if 0 < share < 0.005 else f"{100 * share:.0f} %"
+
+
 def first_of(names: Sequence[str], most: int) -> str:
     """Return the first names of a list and how many more there are, for example ``a, b, c and 4 more``."""
     return ", ".join(names[:most]) + (f" and {len(names) - most:,} more" if len(names) > most else "")

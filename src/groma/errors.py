@@ -61,6 +61,12 @@ def check_kind(value: object, kinds: type | tuple[type, ...], name: str, way: st
         raise InputError(f"{name} must be a {wanted}; got {type(value).__name__}. {way}")
 
 
+def require(condition: object, what: str, message: str) -> None:
+    """Raise AssertionError where a check of :mod:`groma.testing` does not hold: of which part, and what came."""
+    if not condition:
+        raise AssertionError(f"{what}: {message}.")
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return the end of a message about a name that is not known: `` Did you mean 'huber'?``; empty if none is near."""
     by_key = {other.lower().replace("-", "_"): other for other in known}

@@ -12,8 +12,8 @@ from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.uncertainty import pose_uncertainty
 from groma.geometry import quaternion, se3
 from groma.mapping.options import MapOptions
+from groma.mapping.point_base import adjust_with_survey
 from groma.mapping.result import MapResult
-from groma.mapping.surveyed import adjust_with_survey
 from groma.scene import Cameras, Scene
 from groma.scene.camera import CAMERA, Rigs, Sensors
 from groma.scene.image import Frames, Images

@@ -22,8 +22,8 @@ from groma.mapping import map as mapping
 from groma.mapping.checkpoint_files import SCENE, FileKind
 from groma.mapping.checkpoints import Stages, digest, has_stages, remove_stages, stage
 from groma.mapping.map import MapOptions
+from groma.mapping.point_base import adjust_with_survey
 from groma.mapping.read_rows import adjust_as_measured, adjust_read_rows
-from groma.mapping.surveyed import adjust_with_survey
 
 posix = pytest.mark.skipif(os.name == "nt", reason="signals of POSIX systems")
 

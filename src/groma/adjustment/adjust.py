@@ -4,25 +4,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import astuple, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 
 from groma._counted import counted
 from groma._log import log_warnings, logger_of
-from groma._typing import FloatArray
+from groma._typing import IntArray
 from groma.adjustment.assemble import Assembly, assemble, disassemble
 from groma.adjustment.assembly_options import SURFACE_SIGMA_PX, AssemblyOptions
-from groma.adjustment.fit import inliers, noise_of
-from groma.adjustment.misfit.calibration import doubtful_cameras, refuse_focal_lengths
+from groma.adjustment.fit import noise_of
+from groma.adjustment.misfit.calibration import refuse_focal_lengths
 from groma.adjustment.misfit.lens import begin_lens_test
 from groma.adjustment.misfit.rig import rig_that_does_not_fit
 from groma.adjustment.misfit.turning import motion_that_may_be_turning
-from groma.adjustment.pixel_residuals import redundancy_of, squared_residuals_px
+from groma.adjustment.outcome import drop_failed_relations, report_of
+from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.adjustment.places import at_places_of
-from groma.adjustment.relation_outcome import drop_failed_relations
-from groma.adjustment.report import AdjustReport, AdjustResult, Progress, not_converged
+from groma.adjustment.report import AdjustReport, AdjustResult, Progress
 from groma.adjustment.rescue.clusters import settle_clusters
 from groma.adjustment.rescue.restart import renew_lines, with_seen_ends
 from groma.adjustment.rescue.slips import without_slips
@@ -50,16 +50,14 @@ from groma.scene.checks import check_scene_given
 from groma.scene.local_frame import local_frame
 from groma.solver.linear.blas import one_blas_thread
 from groma.solver.options import SolverOptions
-from groma.solver.report import SolveReport
+from groma.solver.report import Iteration, SolveReport
 from groma.solver.solve import solve
+
+_Progress = Callable[[Progress], bool | None] | None
 
 #: The default for what comes from matching: first a loss that pulls from afar, then one that ignores what stayed far.
 #: Losses by name and scale in pixels; see the page *How to choose* for the measurements behind them.
 ROBUST_STAGES = (("cauchy", 1.0), ("geman_mcclure", 2.0))
-#: Terms that a report counts among the observations, and among the relations; and what was not measured.
-COUNTED_OTHERWISE = (
-    "point observations", "line observations", "relations", "relations in pixels", "principal points", "held scale",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -174,7 +172,7 @@ def adjust(
     return replace(result, scene=back, problem=result.problem and at_places_of(result.problem, back))
 
 
-def _settled(scene: Scene, options: AdjustOptions, progress: Callable[[Progress], bool | None] | None) -> AdjustResult:
+def _settled(scene: Scene, options: AdjustOptions, progress: _Progress) -> AdjustResult:
     """Adjust a scene that is first and last placed where measured places and poses known beforehand fit best."""
     if not options.refine_poses:
         return _adjusted(scene, options, progress)
@@ -184,9 +182,7 @@ def _settled(scene: Scene, options: AdjustOptions, progress: Callable[[Progress]
     return replace(result, scene=after, problem=result.problem and at_places_of(result.problem, after, shifted=False))
 
 
-def _in_model(
-    scene: Scene, options: AdjustOptions, name: str, progress: Callable[[Progress], bool | None] | None
-) -> tuple[Scene, AdjustOptions]:
+def _in_model(scene: Scene, options: AdjustOptions, name: str, progress: _Progress) -> tuple[Scene, AdjustOptions]:
     """Return the scene with its cameras in another model, and the options to adjust it with.
 
     Segments are turned into rays before a solve, so points settle what they need to know of the lens.
@@ -200,70 +196,92 @@ def _in_model(
     return scene, options
 
 
-def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress], bool | None] | None) -> AdjustResult:
-    """Adjust a scene that is near the origin of its world."""
-    stages = losses_of(scene, options)
-    relation_loss = relation_loss_of(scene, options)
-    assembly = assemble(scene, assembly_options_of(scene, options, stages[-1], relation_loss), options.terms)
-    if not assembly.problem.factors:
-        if not scene.num_point_observations and not scene.num_line_observations:
-            raise InputError(
-                f"There is nothing to adjust: the scene has {counted(scene.num_images, 'images')} and no observations "
-                "of points or lines. groma map PHOTOGRAPHS --poses FILE finds them at the poses of a file."
-            )
-        raise InputError(
-            f"There is nothing to adjust: the scene has {counted(scene.num_images, 'images')}, "
-            f"{scene.num_point_observations:,} point and {scene.num_line_observations:,} line observations, and the "
-            "options leave none of them. Check the input and --no-points / --no-lines."
-        )
-    problem, reports, moved, layouts = assembly.problem, [], [], Layouts()
-    for number, loss in enumerate(stages):
-        last = number + 1 == len(stages)
+class _StageProgress:
+    """Passes on the steps of one stage, and says after each whether to go on: if ``patient`` also after a refused one.
+
+    Steps are counted from the ``spent`` ones of the stages before.
+    """
+
+    def __init__(self, spent: int, most: int, patient: bool, progress: _Progress) -> None:
+        self.spent, self.most, self.patient, self.progress = spent, most, patient, progress
+        self.is_stopped = False
+
+    def __call__(self, record: Iteration) -> bool:
+        event = Progress(self.spent + record.iteration, self.most, record.cost)
+        logger_of("adjustment").debug("step %d of at most %d, cost %.6g", *astuple(event))
+        if self.progress is not None and self.progress(event) is False:
+            self.is_stopped = True
+        return not self.is_stopped and (record.accepted or self.patient)
+
+
+@dataclass
+class _Solving:
+    """A problem and what its stages did so far."""
+
+    problem: Problem
+    losses: list[Loss]
+    reports: list[SolveReport] = field(default_factory=list)
+    #: Lines that were restarted after a stage.
+    restarted: list[IntArray] = field(default_factory=list)
+    layouts: Layouts = field(default_factory=Layouts)
+
+    def take(self, problem: Problem, lines: IntArray) -> None:
+        """Go on with a problem in which some lines were restarted."""
+        self.problem, restarted = with_held_states(self.problem, problem, lines)
+        self.restarted.append(restarted)
+
+
+def _solve_stages(scene: Scene, options: AdjustOptions, assembly: Assembly, progress: _Progress) -> _Solving:
+    """Solve with one loss after the other, and restart lines in wrong minima between them."""
+    solving, relation_loss = _Solving(assembly.problem, losses_of(scene, options)), relation_loss_of(scene, options)
+    reports, layouts = solving.reports, solving.layouts
+    for number, loss in enumerate(solving.losses):
+        last = number + 1 == len(solving.losses)
         spent = sum(report.iterations for report in reports)
         solver_options = SolverOptions(
             max_iterations=options.max_iterations - spent,
             function_tolerance=options.function_tolerance if last else stage_tolerance(loss),
             start_tolerance=start_tolerance_of(scene, options),
             linear_solver=options.linear_solver,
-            landmark_steps=_landmark_steps(options, loss, problem),
-            landmark_groups=("lines",) if isinstance(loss, Trivial) and not _is_coupled(problem) else None,
+            landmark_steps=_landmark_steps(options, loss, solving.problem),
+            landmark_groups=("lines",) if isinstance(loss, Trivial) and not _is_coupled(solving.problem) else None,
             initial_damping=damping_after(reports, loss),
             threads=options.threads,
         )
-
-        patient, stopped = last or not isinstance(loss, Trivial), []
-
-        def tell(record, spent=spent, patient=patient, stopped=stopped) -> bool:
-            event = Progress(spent + record.iteration, options.max_iterations, record.cost)
-            logger_of("adjustment").debug("step %d of at most %d, cost %.6g", *astuple(event))
-            if progress is not None and progress(event) is False:
-                stopped.append(event)
-            return not stopped and (record.accepted or patient)
-
+        steps = _StageProgress(spent, options.max_iterations, last or not isinstance(loss, Trivial), progress)
         if last and number:
-            loss = stages[number] = _wide_enough(loss, replace(assembly, problem=problem))
-        solution = solve(
-            with_loss(problem, loss, relation_loss, options.line_loss_factor), solver_options, tell, layouts
-        )
-        problem = solution.problem
+            loss = solving.losses[number] = _wide_enough(loss, replace(assembly, problem=solving.problem))
+        under_loss = with_loss(solving.problem, loss, relation_loss, options.line_loss_factor)
+        solution = solve(under_loss, solver_options, steps, layouts)
+        solving.problem = solution.problem
         reports.append(solution.report)
-        if stopped:
+        if steps.is_stopped:
             break
-        for renew in (renew_lines, settle_clusters) if options.max_iterations and not last else ():
-            problem, renewed = with_held_states(problem, *renew(scene, problem, options.threads))
-            moved.append(renewed)
+        if options.max_iterations and not last:
+            solving.take(*renew_lines(scene, solving.problem, options.threads))
+            solving.take(*settle_clusters(scene, solving.problem, options.threads))
         if not isinstance(loss, Trivial) and solution.report.iterations:
-            problem, renewed = with_held_states(problem, *without_slips(problem, options.threads))
-            moved.append(renewed)
-            if last and problem is not solution.problem:
-                reports[-1] = with_costs_at(reports[-1], problem, layouts)
+            solving.take(*without_slips(solving.problem, options.threads))
+            if last and solving.problem is not solution.problem:
+                reports[-1] = with_costs_at(reports[-1], solving.problem, layouts)
+    return solving
+
+
+def _adjusted(scene: Scene, options: AdjustOptions, progress: _Progress) -> AdjustResult:
+    """Adjust a scene that is near the origin of its world."""
+    last_loss, relation_loss = losses_of(scene, options)[-1], relation_loss_of(scene, options)
+    assembly = assemble(scene, assembly_options_of(scene, options, last_loss, relation_loss), options.terms)
+    if not assembly.problem.factors:
+        raise InputError(_nothing_to_adjust(scene))
+    solved = _solve_stages(scene, options, assembly, progress)
+    problem, reports, losses = solved.problem, solved.reports, solved.losses
     residuals = Residuals(problem)
     lens = begin_lens_test(problem, options.threads, residuals) if options.check_lens else None
-    report = combined(reports, assembly.problem, stages, options.line_loss_factor, layouts)
+    report = combined(reports, assembly.problem, losses, options.line_loss_factor, solved.layouts)
     adjusted, relations = drop_failed_relations(disassemble(scene, problem), problem)
-    if any(map(len, moved)):
-        adjusted = with_seen_ends(adjusted, np.unique(np.concatenate(moved)))
-    outcome = _outcome(scene, assembly, problem, report, relations, stage_entries(stages, reports), residuals)
+    if any(map(len, solved.restarted)):
+        adjusted = with_seen_ends(adjusted, np.unique(np.concatenate(solved.restarted)))
+    outcome = report_of(scene, assembly, problem, report, relations, stage_entries(losses, reports), residuals)
     if lens is not None:
         rig = rig_that_does_not_fit(scene, problem, options.threads)
         free = options.refine_poses and options.refine_intrinsics
@@ -273,41 +291,24 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
     return AdjustResult(adjusted, outcome, problem)
 
 
+def _nothing_to_adjust(scene: Scene) -> str:
+    start = f"There is nothing to adjust: the scene has {counted(scene.num_images, 'images')}"
+    if not scene.num_point_observations and not scene.num_line_observations:
+        return (
+            f"{start} and no observations of points or lines. groma map PHOTOGRAPHS --poses FILE finds them at the "
+            "poses of a file."
+        )
+    return (
+        f"{start}, {scene.num_point_observations:,} point and {scene.num_line_observations:,} line observations, and "
+        "the options leave none of them. Check the input and --no-points / --no-lines."
+    )
+
+
 def _log(outcome: AdjustReport) -> None:
     images, observations = counted(outcome.num_images, "images"), counted(outcome.num_observations, "observations")
     cost, steps = (outcome.solve.initial_cost, outcome.solve.final_cost), counted(outcome.solve.iterations, "steps")
     logger_of("adjustment").info("%s, %s: cost %.5g -> %.5g, %s", images, observations, *cost, steps)
     log_warnings("adjustment", outcome.warnings)
-
-
-def _outcome(
-    scene: Scene,
-    assembly: Assembly,
-    problem: Problem,
-    report: SolveReport,
-    relations: dict[str, dict[str, int]],
-    stages: tuple[dict[str, Any], ...],
-    residuals: Residuals,
-) -> AdjustReport:
-    """Say in numbers what an adjustment did: from the problem of the assembly to the one that was solved."""
-    now, redundancy = replace(assembly, problem=problem), redundancy_of(assembly)
-    before, after = squared_residuals_px(assembly), squared_residuals_px(now, residuals=residuals)
-    counts, start = assembly.num_measurements, assembly.problem.variables
-    return AdjustReport(
-        num_images=scene.num_images,
-        num_points=scene.num_points if "points" in start else 0,
-        num_lines=scene.num_lines if "lines" in start else 0,
-        num_planes=scene.num_planes if "planes" in start else 0,
-        num_observations=sum(len(group.factor) for group in assembly.groups if group.observes),
-        num_measurements={name: count for name, count in counts.items() if name not in COUNTED_OTHERWISE},
-        rmse_px={kind: {"before": _rms(before[kind]), "after": _rms(after[kind])} for kind in before},
-        inliers=inliers(before, after, redundancy),
-        sigma0=_sigma0(squared_residuals_px(now, weighted=True, residuals=residuals), redundancy),
-        solve=report,
-        relations=relations,
-        stages=stages,
-        warnings=(*doubtful_cameras(scene), *assembly.notes, *not_converged(report), *report.warnings),
-    )
 
 
 def losses_of(scene: Scene, options: AdjustOptions) -> list[Loss]:
@@ -386,14 +387,3 @@ def assembly_options_of(
     if is_bal and options.refine_intrinsics is None:
         chosen["refine_intrinsics"] = True
     return AssemblyOptions(**chosen | {"loss": loss, "relation_loss": relation_loss, "drop_behind": not is_bal})
-
-
-def _rms(squares: FloatArray) -> float:
-    return float(np.sqrt(np.mean(squares)))
-
-
-def _sigma0(squares: dict[str, FloatArray], redundancy: dict[str, FloatArray]) -> float | None:
-    """Return the noise that the observations show, in units of the noise that was stated."""
-    joined = [np.concatenate([np.zeros(0), *(part[kind] for kind in squares)]) for part in (squares, redundancy)]
-    sigma = noise_of(*joined)
-    return sigma if np.isfinite(sigma) else None

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from groma import cameras
 from groma._typing import FloatArray
+from groma.errors import require
 from groma.features.contract import ImageRetrieval, ImageView, SegmentDetector, SegmentMatcher
 from groma.features.lsd import LsdDetector
 from groma.features.segments import Segments
@@ -55,19 +56,19 @@ def check_detector(detector: SegmentDetector) -> None:
     name, image = type(detector).__name__, picture()
     before = image.copy()
     found, again = detector.detect(image), detector.detect(image)
-    _require(isinstance(found, Segments), name, f"detect() must return Segments; got {type(found).__name__}")
-    _require(np.array_equal(image, before), name, "detect() changed the image")
-    _require(np.array_equal(found.ends, again.ends), name, "the same image gives other segments the second time")
+    require(isinstance(found, Segments), name, f"detect() must return Segments; got {type(found).__name__}")
+    require(np.array_equal(image, before), name, "detect() changed the image")
+    require(np.array_equal(found.ends, again.ends), name, "the same image gives other segments the second time")
     finite = bool(np.isfinite(found.ends).all() and np.isfinite(found.sigma).all())
-    _require(finite and bool((found.sigma > 0.0).all()), name, "end points and sigma must be finite, sigma positive")
+    require(finite and bool((found.sigma > 0.0).all()), name, "end points and sigma must be finite, sigma positive")
     near = _distances(found.ends, _edges()) < 1.0
     hit, on_edge = np.any(near, axis=0), np.any(near, axis=1)
-    _require(hit.mean() >= 0.5, name, f"only {hit.sum()} of {len(hit)} edges are found; first pixel's centre at 0.5?")
-    _require(on_edge.mean() >= 0.9, name, f"{(~on_edge).sum()} of {len(found)} segments lie on no edge")
+    require(hit.mean() >= 0.5, name, f"only {hit.sum()} of {len(hit)} edges are found; first pixel's centre at 0.5?")
+    require(on_edge.mean() >= 0.9, name, f"{(~on_edge).sum()} of {len(found)} segments lie on no edge")
     darker = _left_is_darker(image, found.ends[on_edge])
-    _require(darker.mean() >= 0.9, name, "the darker side must lie to the left of the way from first to second end")
+    require(darker.mean() >= 0.9, name, "the darker side must lie to the left of the way from first to second end")
     for blank in (np.full((60, 80), 90, np.uint8), np.zeros((4, 4), np.uint8)):
-        _require(len(detector.detect(blank)) == 0, name, f"an image of one grey {blank.shape} gives segments")
+        require(len(detector.detect(blank)) == 0, name, f"an image of one grey {blank.shape} gives segments")
 
 
 def _distances(ends: FloatArray, edges: FloatArray) -> FloatArray:
@@ -121,12 +122,12 @@ def check_matcher(matcher: SegmentMatcher) -> None:
     one, two = views[0].segments.ends[found.pairs[:, 0]], views[1].segments.ends[found.pairs[:, 1]]
     right = np.abs(one - two - [_SHIFT, 0.0, _SHIFT, 0.0]).max(axis=1, initial=0.0) < 3.0
     min_matches = 0.5 * min(len(view.segments) for view in views)
-    _require(
+    require(
         len(found) >= min_matches, name, f"only {len(found)} segments are matched; expected at least {min_matches:.0f}"
     )
-    _require(right.mean() >= 0.9, name, f"{(~right).sum()} of {len(found)} matches are wrong")
+    require(right.mean() >= 0.9, name, f"{(~right).sum()} of {len(found)} matches are wrong")
     bare = _with(views[1], segments=Segments.empty())
-    _require(len(matcher.match(first, matcher.describe(bare))) == 0, name, "an image without segments has matches")
+    require(len(matcher.match(first, matcher.describe(bare))) == 0, name, "an image without segments has matches")
     matcher.match(first, matcher.describe(_with(views[1], cam_from_world=None)))
 
 
@@ -148,12 +149,7 @@ def check_retrieval(retrieval: ImageRetrieval) -> None:
     name, image = type(retrieval).__name__, picture()
     others = [retrieval.describe(other) for other in (image[:, ::-1].copy(), picture(_SHIFT), image)]
     alike = np.asarray(retrieval.similarity(retrieval.describe(image), others))
-    _require(alike.shape == (3,), name, f"similarity() must return one number an image; got {alike.shape} for 3")
-    _require(bool(np.isfinite(alike).all()), name, f"similarities must be finite; got {alike}")
-    _require(bool(alike[2] >= alike[1] > alike[0]), name, f"mirror image, view beside, same image: got {alike}")
-    _require(np.shape(retrieval.similarity(others[0], [])) == (0,), name, "no images must give no numbers")
-
-
-def _require(condition: object, name: str, message: str) -> None:
-    if not condition:
-        raise AssertionError(f"{name}: {message}.")
+    require(alike.shape == (3,), name, f"similarity() must return one number an image; got {alike.shape} for 3")
+    require(bool(np.isfinite(alike).all()), name, f"similarities must be finite; got {alike}")
+    require(bool(alike[2] >= alike[1] > alike[0]), name, f"mirror image, view beside, same image: got {alike}")
+    require(np.shape(retrieval.similarity(others[0], [])) == (0,), name, "no images must give no numbers")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from groma.errors import FileFormatError, OutputError
+from groma.errors import FileFormatError, OutputError, require
 from groma.io.registry import SceneFormat, check_target, formats, read_scene, write_scene
 from groma.scene import Scene
 
@@ -38,24 +38,24 @@ def check_format(scene_format: SceneFormat | str, scene: Scene, holds: Iterable[
         If one of these does not hold.
     """
     name = scene_format if isinstance(scene_format, str) else scene_format.name
-    known = {one.name: one for one in formats()}
-    _require(name in known, name, f"is not registered; there are {', '.join(known)}")
+    what, known = f"Format {name!r}", {one.name: one for one in formats()}
+    require(name in known, what, f"is not registered; there are {', '.join(known)}")
     ending = next(iter(known[name].endings), "")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"scene{ending}"
         chosen = check_target(scene, path) if known[name].endings else name
-        _require(chosen == name, name, f"the ending {ending!r} chooses the format {chosen!r}")
+        require(chosen == name, what, f"the ending {ending!r} chooses the format {chosen!r}")
         write_scene(scene, path, name)
         try:
             write_scene(scene, path, name)
         except OutputError:
             pass
         else:
-            _require(False, name, "a file is replaced without force; write within groma.io.atomic.atomic_output")
+            require(False, what, "a file is replaced without force; write within groma.io.atomic.atomic_output")
         write_scene(scene, path, name, force=True)
         if known[name].read is None:
             return
-        _compare(name, scene, read_scene(path), holds, tolerance)
+        _compare(what, scene, read_scene(path), holds, tolerance)
         if path.is_file():
             path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
             try:
@@ -64,7 +64,7 @@ def check_format(scene_format: SceneFormat | str, scene: Scene, holds: Iterable[
                 pass
 
 
-def _compare(name: str, written: Scene, read: Scene, holds: Iterable[str], tolerance: float) -> None:
+def _compare(what: str, written: Scene, read: Scene, holds: Iterable[str], tolerance: float) -> None:
     for table in holds:
         before, after = getattr(written, table), getattr(read, table)
         for column in fields(before):
@@ -74,9 +74,4 @@ def _compare(name: str, written: Scene, read: Scene, holds: Iterable[str], toler
                 same = bool(np.allclose(one, two, rtol=0.0, atol=tolerance, equal_nan=True))
             elif same:
                 same = bool((one == two).all())
-            _require(same, name, f"{table}.{column.name} comes back different:\n{one}\n{two}")
-
-
-def _require(condition: bool, name: str, message: str) -> None:
-    if not condition:
-        raise AssertionError(f"Format {name!r}: {message}.")
+            require(same, what, f"{table}.{column.name} comes back different:\n{one}\n{two}")

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from groma._rows import pointers_of
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
@@ -228,7 +229,7 @@ def build_index(
     made = triangulate_features(scene, features, pairs, partial(say, "placing the points of the map"))
     own_covariance, own_noise = _covariances(scene, "points")
     line_covariance, line_noise = _covariances(scene, "lines")
-    rows, offset = [], np.concatenate([[0], np.cumsum([len(one) for one in features])])
+    rows, offset = [], pointers_of([len(one) for one in features])
     known = np.isfinite(own_covariance[:, 0, 0])
     points, pixels, descriptors, sigmas = [], [], [], []
     for image, one in enumerate(found):
@@ -242,7 +243,7 @@ def build_index(
     if not sum(map(len, points)) and not scene.num_lines:
         raise InputError("Nothing in the images of the map can be described: no points, no lines. Pass another map.")
     retrieval = VladRetrieval.learned([one.descriptors for one in features])
-    begin, point = np.concatenate([[0], np.cumsum([len(part) for part in points])]), np.concatenate(points)
+    begin, point = pointers_of([len(part) for part in points]), np.concatenate(points)
     described = Described(point, np.concatenate(pixels), np.concatenate(descriptors), point >= len(made.xyz))
     xyz = np.concatenate([made.xyz, scene.points.xyz])
     images = np.stack([retrieval.gather(one.descriptors) for one in features])
@@ -258,7 +259,7 @@ def build_index(
         begin,
         *described[:3],
         line_covariance,
-        np.concatenate([[0], np.cumsum([len(part) for part in rows])]),
+        pointers_of([len(part) for part in rows]),
         np.concatenate(rows),
         np.concatenate([one.segment_descriptors for one in found]),
         retrieval.vocabulary,

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._numba import loop
+from groma._rows import pointers_of
 from groma._typing import FloatArray, IntArray
 from groma.execution import map_ranges
 from groma.gates import gate
@@ -197,7 +198,7 @@ def pairs_near(
     cells = cell.max(axis=0) + 2
     number = cell[:, 1] * cells[0] + cell[:, 0]
     order = np.argsort(number, kind="stable")
-    begin = np.concatenate([[0], np.cumsum(np.bincount(number, minlength=int(cells[0] * cells[1])))])
+    begin = pointers_of(np.bincount(number, minlength=int(cells[0] * cells[1])))
     least, room = 1.0 - 0.5 * MATCHES.distance**2, 4 * len(here)
     while True:
         rows, columns, far = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room)

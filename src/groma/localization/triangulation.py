@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
-from groma._rows import Rows, column
+from groma._rows import Rows, column, pointers_of
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
@@ -68,7 +68,7 @@ def triangulate_features(
 
     ``say`` is told how many pairs are done, of how many.
     """
-    begin = np.concatenate([[0], np.cumsum([len(one) for one in features])])
+    begin = pointers_of([len(one) for one in features])
     straight = [_straight(scene, image, one) for image, one in enumerate(features)]
     edges: list[IntArray] = [np.zeros((0, 2), np.int64)]
     vectors = [unit(one.descriptors) for one in features]

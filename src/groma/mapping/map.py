@@ -63,15 +63,14 @@ from groma.mapping.noise.observations import line_bend, line_end_correlation, mo
 from groma.mapping.noise.shared import with_shared_noise
 from groma.mapping.options import MapOptions, StageProgress
 from groma.mapping.photographs import checked_photographs, image_files, image_reader, photographs_left_out
+from groma.mapping.point_base import PointBase, find_segment_depths, with_depths, with_measurements
 from groma.mapping.read_rows import adjust_read_rows, mapped_as_measured, read_by_rows, taken_at_once
 from groma.mapping.refine_points import refine_points
 from groma.mapping.result import SCENES_OF_RESULT, MapResult, result_of
 from groma.mapping.start import start_of
 from groma.mapping.structure.find import LandmarkNoise, detect_structure, landmark_noise
 from groma.mapping.structure.flatness import surface_noise_px, with_rough_planes
-from groma.mapping.surveyed import adjust_with_survey, tied
-from groma.mapping.with_depths import find_segment_depths, with_depths
-from groma.scene import Scene
+from groma.scene import Scene, Similarity
 from groma.scene.local_frame import usual_frame
 from groma.solver.linear.blas import one_blas_thread
 
@@ -135,69 +134,88 @@ def map_images(
     OutputError
         If another run works in ``work``, or it cannot be written.
     """
-    options = with_parts(options or MapOptions())
-    say = logged_stages("mapping", progress)
-    folder = Path(images)
+    say, folder = logged_stages("mapping", progress), Path(images)
     files = image_files(folder)
+    given, near, options = _in_usual_frame(model, with_parts(options or MapOptions()))
+    read_by_rows(given or Scene(), options, depth)  # refuses depths beside it before anything is computed
     alone = model is None and line_matches is None and not options.rigs
-    given = model
-    model = None if model is None else ready_to_map(model)
-    if model is not None and options.camera_model is not None:
-        model = model.replace(cameras=model.cameras.with_model(options.camera_model))
-        options = dataclasses.replace(options, refine_intrinsics=options.refine_intrinsics is not False)
-    near = None if model is None else usual_frame(model)
-    if model is not None and near is not None:
-        model = model.transformed(near)
-    read_by_rows(model or Scene(), options, depth)  # refuses depths beside it before anything is computed
-    sizes, copies = checked_photographs(folder, files, model, options.lines.min_images, alone, say)
-    names = list(sizes)
+    sizes, copies = checked_photographs(folder, files, given, options.lines.min_images, alone, say)
     if survey:
         check_survey(survey, tuple(sizes), list(sizes.values()))
-    key = digest(__version__, digest_files(folder, files), model)
+    key = digest(__version__, digest_files(folder, files), given)
     with one_blas_thread(), work_with(options.threads), Stages(Path(work), key, options, say) as stages:
-        placed = start_of(folder, names, model, stages)
-        start = placed.scene
-        bare = start.keep(lines=[])  # those that are left have measured depths, which new segments take over
-        by_rows, segments = read_by_rows(start, options, depth), None
-        if by_rows or options.refine_intrinsics or options.refine_points or survey or depth is not None:
-            points = stages.run(adjust_read_rows if by_rows else adjust_points, bare)
-        else:  # the cameras stay as they are, and more is not needed to find segments
-            found = (find_segments, folder, bare, line_matches)
-            points, segments = stages.run_beside("adjusting points", (adjust_points, bare), *found, given=line_matches)
-        if options.refine_points:
-            points = stages.run(measure_points, folder, points)
-        in_place = tied(start, points, survey) if survey else None
-        if in_place is not None:
-            start, near = in_place.start, in_place.near
-            points = stages.run(adjust_with_survey, in_place.points, given=in_place.points)
-        depths = None if depth is None else with_depths(start, points, near, depth, stages)
-        if depths is not None:
-            start, points, near = depths.start, depths.points, depths.near
-        if segments is None:
-            segments = stages.run(find_segments, folder, points, line_matches, given=line_matches)
-        matches = matches_for(options, folder, points, segments, line_matches)
-        beside = None if by_rows else carried_depths(start, segments)
-        if depths is not None and depth is not None:
-            beside = stages.run(find_segment_depths, points, segments, depth, depths.measured)
-        seen = taken_at_once(points, segments)
-        result = map_segments(seen.scene, seen.segments, matches, stages, neighbors_for(options, folder), beside)
-        result = with_measured_lines(mapped_as_measured(result, seen, stages), start)
-    left_out = photographs_left_out(folder, files, copies, (model or start).images.names, model is not None)
-    left_out = (*left_out, *not_carried(given or Scene(), result.scene))
+        registered = start_of(folder, list(sizes), given, stages)
+        base, segments = _base_of(folder, PointBase(registered.scene, near), line_matches, survey, depth, stages)
+        matches = matches_for(options, folder, base.points, segments, line_matches)
+        if base.depths is not None and depth is not None:
+            segment_depths = stages.run(find_segment_depths, base.points, segments, depth, base.depths)
+        else:
+            segment_depths = None if read_by_rows(base.start, options) else carried_depths(base.start, segments)
+        seen = taken_at_once(base.points, segments)
+        neighbors = neighbors_for(options, folder)
+        mapped = map_segments(seen.scene, seen.segments, matches, stages, neighbors, segment_depths)
+        mapped = with_measured_lines(mapped_as_measured(mapped, seen, stages), base.start)
+    left_out = photographs_left_out(folder, files, copies, (given or base.start).images.names, given is not None)
+    not_kept = not_carried(model or Scene(), mapped.scene)
+    of_depths = base.depths.warnings if base.depths else ()
     result = dataclasses.replace(
-        result,
-        start=start,
-        num_photographs=len(names) if model is None else model.num_images,
-        explanation=" ".join([*placed.notes, result.explanation]),
-        warnings=(*left_out, *placed.warnings, *(depths.measured.warnings if depths else ()), *result.warnings),
-        surveyed=None if in_place is None else in_place.surveyed,
-        depths=None if depths is None else depths.measured,
+        mapped,
+        start=base.start,
+        num_photographs=len(sizes) if given is None else given.num_images,
+        explanation=" ".join([*registered.notes, mapped.explanation]),
+        warnings=(*left_out, *not_kept, *registered.warnings, *of_depths, *mapped.warnings),
+        surveyed=base.surveyed,
+        depths=base.depths,
     )
     log_warnings("mapping", [sentence for sentence in result.warnings if sentence not in result.report.warnings])
-    if near is None:
+    if base.near is None:
         return result
-    scenes = {name: getattr(result, name).transformed(near.inverse()) for name in SCENES_OF_RESULT}
+    scenes = {name: getattr(result, name).transformed(base.near.inverse()) for name in SCENES_OF_RESULT}
     return dataclasses.replace(result, **scenes)
+
+
+def _in_usual_frame(model: Scene | None, options: MapOptions) -> tuple[Scene | None, Similarity | None, MapOptions]:
+    """Return a given model near the origin with the camera model asked for, what brought it there, and the options."""
+    if model is None:
+        return None, None, options
+    ready = ready_to_map(model)
+    if options.camera_model is not None:
+        ready = ready.replace(cameras=ready.cameras.with_model(options.camera_model))
+        options = dataclasses.replace(options, refine_intrinsics=options.refine_intrinsics is not False)
+    near = usual_frame(ready)
+    return ready if near is None else ready.transformed(near), near, options
+
+
+def _base_of(
+    folder: Path,
+    base: PointBase,
+    line_matches: ExternalMatches | None,
+    survey: Survey | None,
+    depth: DepthMaps | None,
+    stages: Stages[MapOptions],
+) -> tuple[PointBase, list[Segments]]:
+    """Return adjusted points and poses, with the measurements of other instruments, and the segments of each image.
+
+    Lines of the start have measured depths, which new segments take over: points are adjusted without them.
+    """
+    options, without_lines = stages.options, base.start.keep(lines=[])
+    by_rows, segments = read_by_rows(base.start, options), None
+    if by_rows or options.refine_intrinsics or options.refine_points or survey or depth is not None:
+        points = stages.run(adjust_read_rows if by_rows else adjust_points, without_lines)
+    else:  # the cameras stay as they are, and more is not needed to find segments
+        found = (find_segments, folder, without_lines, line_matches)
+        aside = (adjust_points, without_lines)
+        points, segments = stages.run_beside("adjusting points", aside, *found, given=line_matches)
+    if options.refine_points:
+        points = stages.run(measure_points, folder, points)
+    base = dataclasses.replace(base, points=points)
+    if survey:
+        base = with_measurements(base, survey, stages)
+    if depth is not None:
+        base = with_depths(base, depth, stages)
+    if segments is None:
+        segments = stages.run(find_segments, folder, base.points, line_matches, given=line_matches)
+    return base, segments
 
 
 def map_segments(

@@ -19,12 +19,9 @@ from groma.adjustment.survey.given_poses import given_poses_of
 from groma.adjustment.survey.gross_errors import reliability_of, without_gross_errors
 from groma.adjustment.survey.records import Reliability
 from groma.io.survey import WorldFrame
-from groma.mapping.checkpoint_files import SCENE
-from groma.mapping.checkpoints import stage
-from groma.mapping.noise.weighted import adjust_weighted, weighted
+from groma.mapping.noise.weighted import adjust_weighted
 from groma.scene import Scene, Similarity
 from groma.scene.checks import check_scene_given
-from groma.scene.local_frame import usual_frame
 from groma.scene.survey import with_rejected
 
 
@@ -95,38 +92,3 @@ def adjust_surveyed(
     if len(result.scene.camera_motions):
         motions = motions_of(result.scene, result.problem)
     return SurveyedResult(result, surveyed, found, motions)
-
-
-@dataclass(frozen=True, eq=False)
-class Tied:
-    """A map on its way, in the frame of measurements."""
-
-    surveyed: Surveyed
-    #: The scene that went in, and the points with the measurements, both near the origin and in a usual unit.
-    start: Scene
-    points: Scene
-    #: What brought them there from the frame of the measurements; None where nothing did.
-    near: Similarity | None
-
-
-def tied(start: Scene, points: Scene, survey: Survey) -> Tied:
-    """Bring the points of a map into the frame of measurements, and add these."""
-    surveyed = with_survey(points, survey)
-    near = usual_frame(surveyed.scene)
-    start, points = start.transformed(surveyed.similarity), surveyed.scene
-    if near is not None:
-        start, points = start.transformed(near), points.transformed(near)
-    return Tied(surveyed, start, points, near)
-
-
-@stage("surveyed", SCENE, lambda options: options.keep_suspects)
-def adjust_with_survey(points: Scene, options: Any, say: Callable[[str, int, int], None]) -> Scene:
-    """Points and poses adjusted with measurements of other instruments, weighted by their noise."""
-
-    def tell(event: Progress) -> None:
-        say("adjusting with measurements", event.iteration, event.max_iterations)
-
-    told = weighted(points, options.adjustment())
-    if options.keep_suspects:
-        return adjust(with_rejected(points, ()), told, tell).scene
-    return without_gross_errors(adjust(points, told, tell), lambda scene: adjust(scene, told, tell))[0].scene

@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from groma.adjustment.adjust import COUNTED_OTHERWISE
 from groma.adjustment.assembly_options import AssemblyOptions
+from groma.adjustment.outcome import COUNTED_OTHERWISE
 from groma.adjustment.parts.checkpoint import FOLDER, Checkpoint, key_of
 from groma.adjustment.parts.communication import agreed
 from groma.adjustment.parts.cut import parts_of

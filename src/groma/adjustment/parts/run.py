@@ -11,11 +11,11 @@ import numpy as np
 
 from groma.adjustment.adjust import damping_after, stage_tolerance
 from groma.adjustment.assemble import disassemble
+from groma.adjustment.outcome import drop_failed_relations
 from groma.adjustment.parts.checkpoint import Checkpoint, Progressed, reports_of
 from groma.adjustment.parts.communication import agreed, exchange
 from groma.adjustment.parts.opened import LANDMARKS, OpenParts
 from groma.adjustment.pixel_residuals import squared_residuals_px
-from groma.adjustment.relation_outcome import drop_failed_relations
 from groma.adjustment.rescue.restart import renew_lines, with_seen_ends
 from groma.adjustment.rescue.slips import without_slips
 from groma.adjustment.stages import STAGES, one_after_another, stage_entries

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.errors import ProblemError
+from groma.errors import ProblemError, require
 from groma.factors._examples import charts
 from groma.factors.checks.world import check_invariance
 from groma.factors.contract import Example, Factor
@@ -167,36 +167,31 @@ def compare_jacobians(example: Example, tolerance: float = TOLERANCE) -> tuple[B
 
 
 # ----------------------------------------------------------------------------------------------------------- Contract
-def _require(condition: bool, name: str, message: str) -> None:
-    if not condition:
-        raise AssertionError(f"Factor {name!r}: {message}")
-
-
-def _check_ranges(name: str, example: Example) -> None:
+def _check_ranges(what: str, example: Example) -> None:
     """Part of the factors, none of them, another order, and columns that are not wanted."""
     factor, sizes, ambients = example.factor, block_sizes_of(example), ambients_of(example)
     count = len(factor)
     record, _ = linearized(factor, ambients, sizes)
-    _require(bool(np.isfinite(record).all()), name, "linearize() left a NaN or wrote less than its columns.")
+    require(bool(np.isfinite(record).all()), what, "linearize() left a NaN or wrote less than its columns")
     residual = residuals_of(factor, ambients)
-    _require(
+    require(
         np.allclose(residual, record[:, :, -1], rtol=1e-12, atol=1e-12),
-        name,
+        what,
         f"residuals() and the last column of linearize() differ:\n{residual}\n{record[:, :, -1]}",
     )
     begin, end = count // 3, count - 1
     same = np.array_equal(linearized(factor, ambients, sizes, begin, end)[0], record[begin:end])
-    _require(same, name, f"linearize({begin}, {end}) differs from those rows of linearize(0, {count}).")
+    require(same, what, f"linearize({begin}, {end}) differs from those rows of linearize(0, {count})")
     same = np.array_equal(residuals_of(factor, ambients, begin, end), residual[begin:end])
-    _require(same, name, f"residuals({begin}, {end}) differs from those rows of residuals(0, {count}).")
+    require(same, what, f"residuals({begin}, {end}) differs from those rows of residuals(0, {count})")
     empty, degenerate = linearized(factor, ambients, sizes, 1, 1)
-    _require(len(empty) == 0 and degenerate == 0, name, "an empty range counts degenerate factors.")
+    require(len(empty) == 0 and degenerate == 0, what, "an empty range counts degenerate factors")
     order = np.arange(count)[::-1]
     same = np.array_equal(linearized(factor.take(order), ambients, sizes)[0], record[order])
-    _require(same, name, "take() in reverse order does not give the records in reverse order.")
+    require(same, what, "take() in reverse order does not give the records in reverse order")
     nothing = factor.take(np.zeros(0, np.int64))
-    _require(len(nothing) == 0, name, "take() of no factor is not empty.")
-    _require(len(linearized(nothing, ambients, sizes)[0]) == 0, name, "no factors give records.")
+    require(len(nothing) == 0, what, "take() of no factor is not empty")
+    require(len(linearized(nothing, ambients, sizes)[0]) == 0, what, "no factors give records")
     starts = np.cumsum([0, *sizes])
     for unwanted in range(len(sizes)):
         columns = tuple(-1 if b == unwanted else int(starts[b]) for b in range(len(sizes)))
@@ -205,7 +200,7 @@ def _check_ranges(name: str, example: Example) -> None:
         expected = record.copy()
         expected[:, :, starts[unwanted] : starts[unwanted + 1]] = _UNTOUCHED
         same = bool(np.allclose(partial, expected, rtol=1e-12, atol=1e-12))
-        _require(same, name, f"columns {columns}: the unwanted block is written, or another one changes.")
+        require(same, what, f"columns {columns}: the unwanted block is written, or another one changes")
 
 
 def _check_world(name: str, example: Example, rng: np.random.Generator) -> None:
@@ -216,7 +211,7 @@ def _check_world(name: str, example: Example, rng: np.random.Generator) -> None:
         check_invariance(name, factor.invariance, slots, ambients, lambda moved: residuals_of(factor, moved), rng)
 
 
-def _check_degenerate(name: str, example: Example) -> None:
+def _check_degenerate(what: str, example: Example) -> None:
     """Variables that are no object at all (all zeros) must give zeros, never NaN."""
     factor, sizes = example.factor, block_sizes_of(example)
     for b, (slot, _) in enumerate(factor.references()):
@@ -225,16 +220,16 @@ def _check_degenerate(name: str, example: Example) -> None:
         record, degenerate = linearized(factor, tuple(ambients), sizes)
         residual = residuals_of(factor, tuple(ambients))
         finite = bool(np.isfinite(record).all() and np.isfinite(residual).all())
-        _require(finite, name, f"NaN or infinity where slot {slot.name!r} is zero.")
+        require(finite, what, f"NaN or infinity where slot {slot.name!r} is zero")
         zero = ~record.any(axis=(1, 2))
-        _require(
+        require(
             degenerate <= int(zero.sum()),
-            name,
+            what,
             f"{degenerate} factors are counted as degenerate where slot {slot.name!r} is zero, but only "
-            f"{int(zero.sum())} records are zero.",
+            f"{int(zero.sum())} records are zero",
         )
         if slot.kind in ("line", "plane", "direction"):
-            _require(degenerate == len(factor), name, f"a {slot.kind} of zeros in slot {slot.name!r} counts as valid.")
+            require(degenerate == len(factor), what, f"a {slot.kind} of zeros in slot {slot.name!r} counts as valid")
 
 
 def check_factor(
@@ -278,9 +273,10 @@ def check_factor(
                     f"from differences by {check.deviation:.2e} of its largest entry (allowed {check.tolerance:.0e}).\n"
                     f"analytic\n{check.analytic}\nnumeric\n{check.numeric}"
                 )
-    _check_ranges(name, example)
+    what = f"Factor {name!r}"
+    _check_ranges(what, example)
     _check_world(name, example, rng)
-    _check_degenerate(name, example)
+    _check_degenerate(what, example)
     for group, (_, state) in example.variables.items():
-        _require(np.array_equal(state, before[group]), name, f"the states of group {group!r} were changed.")
+        require(np.array_equal(state, before[group]), what, f"the states of group {group!r} were changed")
     return FactorCheck(name, blocks)

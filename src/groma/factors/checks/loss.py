@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from groma._typing import FloatArray
+from groma.errors import require
 from groma.factors.losses import Loss
 
 #: Squared norms at which derivatives are compared, in squared standard deviations.
@@ -33,13 +34,13 @@ def check_loss(loss: Loss, tolerance: float = 1e-6) -> None:
         If a promise is broken.
     """
     value, weight, second = loss.evaluate(np.zeros(1))
-    _require(value[0] == 0.0, loss, f"rho(0) must be 0; got {value[0]}")
-    _require(abs(weight[0] - 1.0) <= 1e-12, loss, f"rho'(0) must be 1; got {weight[0]}")
+    require(value[0] == 0.0, repr(loss), f"rho(0) must be 0; got {value[0]}")
+    require(abs(weight[0] - 1.0) <= 1e-12, repr(loss), f"rho'(0) must be 1; got {weight[0]}")
     value, weight, second = loss.evaluate(_NORMS)
-    _require(bool(np.isfinite([value, weight, second]).all()), loss, f"a number is not finite at {_NORMS}")
-    _require(bool((np.diff(value) >= 0.0).all()), loss, f"rho falls: {value} at {_NORMS}")
+    require(bool(np.isfinite([value, weight, second]).all()), repr(loss), f"a number is not finite at {_NORMS}")
+    require(bool((np.diff(value) >= 0.0).all()), repr(loss), f"rho falls: {value} at {_NORMS}")
     bounded = bool(((weight >= 0.0) & (weight <= 1.0 + 1e-12)).all())
-    _require(bounded, loss, f"rho' must lie between 0 and 1; got {weight} at {_NORMS}")
+    require(bounded, repr(loss), f"rho' must lie between 0 and 1; got {weight} at {_NORMS}")
     _compare(loss, "rho'", 0, weight, tolerance, np.ones_like(_NORMS))
     _compare(loss, "rho''", 1, second, tolerance, _NORMS)
 
@@ -49,13 +50,8 @@ def _compare(loss: Loss, name: str, order: int, derivative: FloatArray, toleranc
     plus, minus = loss.evaluate(_NORMS + step)[order], loss.evaluate(_NORMS - step)[order]
     deviation = np.abs((plus - minus) / (2.0 * step) - derivative) * scale
     worst = int(np.argmax(np.where(np.isnan(deviation), np.inf, deviation)))
-    _require(
+    require(
         bool(deviation[worst] <= tolerance),
-        loss,
+        repr(loss),
         f"{name} differs from differences by {deviation[worst]:.2e} (allowed {tolerance:.0e}) at {_NORMS[worst]}",
     )
-
-
-def _require(condition: bool, loss: Loss, message: str) -> None:
-    if not condition:
-        raise AssertionError(f"{loss!r}: {message}.")

@@ -28,6 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._numba import loop
+from groma._rows import pointers_of
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
@@ -90,7 +91,7 @@ class Responses:
     @cached_property
     def begin(self) -> IntArray:
         """Where the rows of each landmark begin, and end."""
-        return np.concatenate([[0], np.cumsum(np.bincount(self.seen[:, 0], minlength=1))]).astype(np.int64)
+        return pointers_of(np.bincount(self.seen[:, 0], minlength=1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from groma._counted import counted
+from groma._counted import counted, whole_percent
 from groma._rows import pointers_of
 from groma._typing import FloatArray, IntArray
 from groma.features.segments import Segments
@@ -95,29 +95,20 @@ def explain(line_map: LineMap, num_left_out: int = 0, min_confidence: float = 0.
         )
     mapped = counts[Outcome.MAPPED] + counts[Outcome.RECOVERED]
     source = f"from {mapped:,} of {total:,} segments in {counted(len(line_map.outcomes), 'images')}"
-    head = f"{_lines(line_map.num_lines)} {source}."
+    head = f"{counted(line_map.num_lines, 'lines')} {source}."
     if num_left_out:
         head = (
-            f"{_lines(line_map.num_lines - num_left_out)}, of {line_map.num_lines:,} {source}: {num_left_out:,}, "
-            f"right with a probability below {min_confidence:g} (--min-confidence), "
+            f"{counted(line_map.num_lines - num_left_out, 'lines')}, of {line_map.num_lines:,} {source}: "
+            f"{num_left_out:,}, right with a probability below {min_confidence:g} (--min-confidence), "
             f"{'is' if num_left_out == 1 else 'are'} left out."
         )
     lost = sorted(((n, outcome) for outcome, n in counts.items() if outcome > Outcome.RECOVERED and n), reverse=True)
     if not lost:
         return head
-    parts = [f"{n:,} ({_percent(n, total)}) {WORDS[outcome]}" for n, outcome in lost[:_NAMED]]
+    parts = [f"{n:,} ({whole_percent(n / total)}) {WORDS[outcome]}" for n, outcome in lost[:_NAMED]]
     others = sum(n for n, _ in lost[_NAMED:])
     if others:
-        parts.append(f"{others:,} ({_percent(others, total)}) were lost for other reasons")
+        parts.append(f"{others:,} ({whole_percent(others / total)}) were lost for other reasons")
     start = "The map is empty" if line_map.num_lines == 0 else "Of the segments on no line"
     remedy = next((f" What would help most: {REMEDIES[outcome]}." for _, outcome in lost if outcome in REMEDIES), "")
     return f"{head} {start}: {'; '.join(parts)}.{remedy}"
-
-
-def _lines(number: int) -> str:
-    return f"{number:,} {'line' if number == 1 else 'lines'}"
-
-
-def _percent(part: int, total: int) -> str:
-    # derived from rounding to whole percents
-    return f"{100.0 * part / total:.0f} %" if 200 * part >= total else "under 1 %"

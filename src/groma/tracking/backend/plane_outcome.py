@@ -9,7 +9,7 @@ import numpy as np
 
 from groma._counted import counted
 from groma.adjustment.assemble import assemble
-from groma.adjustment.relation_outcome import drop_failed_relations
+from groma.adjustment.outcome import drop_failed_relations
 from groma.gates import NORMAL
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.gates import DEFAULT, LandmarkPlaneGates

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from groma._counted import whole_percent
 from groma._typing import FloatArray, IntArray
 from groma.viz.report import digits as _digits
 
@@ -160,10 +161,6 @@ def _log_ticks(low: float, high: float) -> list[float]:
     return _digits.ticks(first, final, _digits.round_step(final - first, 6))
 
 
-def _percent(share: float) -> str:
-    return "under 1 %" if 0 < share < 0.005 else f"{100 * share:.0f} %"
-
-
 def bars(names: Sequence[str], before: FloatArray | None, after: FloatArray) -> str:
     """Return one pair of bars per image: root mean square residual in pixels, the worst after adjustment first."""
     order = np.argsort(-after, kind="stable")[:MAX_BARS]
@@ -292,7 +289,7 @@ def shares(parts: Sequence[tuple[str, int, str]]) -> str:
     )
     legend = "".join(
         f'<span class="key" style="--c:{colour}"><span>{html.escape(words)}</span><b>{count:,}</b>'
-        f"<span>{_percent(count / total)}</span></span>"
+        f"<span>{whole_percent(count / total)}</span></span>"
         for words, count, colour in parts
         if count
     )
