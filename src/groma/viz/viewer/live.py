@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from groma._counted import counted
+from groma._counted import counted, duration
 from groma._typing import FloatArray
 from groma.bounded.text import finite, read_words
 from groma.errors import GromaError
@@ -244,7 +244,7 @@ class LiveView:
         if self.state == RUNNING and self._seen:
             silence = time.time() - max(self._seen.values()) * 1e-9
             if silence > QUIET:
-                lines = f"**Nothing new for {silence:.0f} s.** The track may have been stopped."
+                lines = f"**Nothing new for {duration(silence)}.** The track may have been stopped."
         if self.statuses is not None and len(self.statuses) and self.state == RUNNING:
             lines += f"\n\n{self.statuses.sentence()}"
         if self.scene is not None:
