@@ -123,15 +123,15 @@ class LiveView:
         return changed
 
     def _files(self, running: bool) -> dict[str, Callable[[Path], None]]:
-        """Return the function that draws each file, by name."""
+        """Return the function that draws each file, by name; the scene first, whose size is that of the cameras."""
         scene: dict[str, Callable[[Path], None]] = {"scene.npz": lambda path: self._draw_scene(read_scene(path))}
         if not running:
-            return {"trajectory.txt": lambda path: self._draw_path(read_tum(path).world_from_cam), **scene}
+            return {**scene, "trajectory.txt": lambda path: self._draw_path(read_tum(path).world_from_cam)}
         return {
+            **scene,
             "frames.txt": lambda path: self._draw_path(read_frames(path)),
             "statuses.txt": lambda path: self._show_statuses(read_statuses(path)),
             "now.npz": lambda path: self._show_picture(read_now(path)),
-            **scene,
         }
 
     def _is_new(self, path: Path) -> bool:
