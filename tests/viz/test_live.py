@@ -119,7 +119,7 @@ def test_the_panel_of_a_running_track(tmp_path, scene):
         assert view.picture.visible and view.timeline.visible and view.statuses is not None
         assert "**weak**" in view._words.content
         assert view._now.position.tolist() == [0.1, 0, 4]  # the last frame
-        assert view._now.scale == pytest.approx(1.5 * view._nodes["keyframes"][0].scale)  # though it came before the map
+        assert view._now.scale == pytest.approx(1.5 * view._nodes["keyframes"][0].scale)
         view.frame_shown.value = 2
         assert view._now.position.tolist() == [0.1, 0, 1]
         (work / "frames.txt").write_text("".join(ROW.format(0.1 * k, float(k), 0) for k in range(6)))
