@@ -31,6 +31,7 @@ _STAGES = {
     "solve": "steps of the cameras",
     "backsubstitute": "steps of the landmarks",
     "cost": "costs of trial steps",
+    "total": "total",
 }
 #: Words and colours of the outcomes of segments.
 _OUTCOMES = {
@@ -154,8 +155,8 @@ def number_tables(scene: Scene, before: Drawable | None, after: Drawable, number
     rows = [[name, f"{count:,}"] for name, count in counts_of(scene, after) if count]
     text += table("Scene", "What it holds.", ["", "number"], rows)
     if numbers is not None:
-        seconds = [[_STAGES.get(name, name), f"{value:.3f} s"] for name, value in numbers["seconds"].items() if name != "total"]
-        seconds.append(["total", f"{numbers['seconds']['total']:.3f} s"])
+        spent = numbers["seconds"]
+        seconds = [[words, f"{spent[name]:.3f} s"] for name, words in _STAGES.items() if name in spent]
         text += table(
             "Time",
             "Where the last adjustment spent it; the first run on a machine compiles, too.",
