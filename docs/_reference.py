@@ -22,8 +22,8 @@ class PackageReference(SphinxDirective):
         package = importlib.import_module(self.arguments[0])
         names = [package.__name__]
         found = {module.name for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")}
-        names += [f"{package.__name__}.{name}" for name in self.arguments[1:]]
         names += sorted(name for name in found if "._" not in name)
+        names += [f"{package.__name__}.{name}" for name in self.arguments[1:]]
         return [self._section(name) for name in dict.fromkeys(names)]
 
     def _section(self, name: str) -> nodes.Node:

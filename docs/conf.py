@@ -49,6 +49,8 @@ autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 autodoc_default_options = {"show-inheritance": True}
 autodoc_preserve_defaults = True
+# The contents beside a page say "loss", not "AdjustOptions.loss", which breaks over two lines.
+toc_object_entries_show_parents = "hide"
 # There are none; looking for them parses the source of every function.
 autodoc_use_type_comments = False
 # Signatures say FloatArray and not what that is made of.
@@ -97,12 +99,14 @@ def _shorten_signature(
 
 
 def _shorten_attributes(app: Sphinx, doctree: nodes.document) -> None:
-    """Do the same for the types of attributes and for what a name stands for, which are no signatures."""
+    """Do the same for the types of attributes and for what a name stands for; drop bases that say nothing."""
     for kind in (addnodes.desc_annotation, nodes.paragraph):
         for part in list(doctree.findall(kind)):
             text = part.astext()
             if (kind is addnodes.desc_annotation or text.startswith("alias of")) and _short(text) != text:
                 part.children = [nodes.Text(_short(text))]
+            elif text == "Bases: object":
+                part.parent.remove(part)
 
 
 def _escape_signs(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:

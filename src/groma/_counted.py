@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Numbers as a person reads them: counts in every sentence, table and message, and numbers in names."""
+"""Numbers as a person reads them: counts and durations in sentences, tables and messages, and numbers in names."""
 
 from __future__ import annotations
 
@@ -20,6 +20,15 @@ def whole_percent(share: float) -> str:
 def first_of(names: Sequence[str], most: int) -> str:
     """Return the first names of a list and how many more there are, for example ``a, b, c and 4 more``."""
     return ", ".join(names[:most]) + (f" and {len(names) - most:,} more" if len(names) > most else "")
+
+
+def duration(seconds: float) -> str:
+    """Return a duration in at most two units: ``40 s``, ``2 min 5 s``, ``3 h 10 min``."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    minutes, rest = divmod(whole, 60)
+    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:

@@ -7,7 +7,7 @@ A package names modules in the entry-point group ``groma.plugins``::
     my_lab = "my_lab.groma_parts"
 
 The command line imports them all before a command runs; importing registers camera models, factors, losses, charts and
-file formats by the decorators of each room. In Python, import the module yourself, or call :func:`load_plugins`.
+file formats through their decorators. In Python, import the module yourself, or call :func:`load_plugins`.
 Detectors, matchers and retrieval have groups of their own (:mod:`groma.features.registry`).
 """
 
@@ -22,7 +22,7 @@ GROUP = "groma.plugins"
 
 @cache
 def load_plugins() -> tuple[str, ...]:
-    """Import the plugins of all installed packages, once, and return their names; one that is broken warns."""
+    """Import the plugins of all installed packages, once, and return their names; a broken one causes a warning."""
     loaded = []
     for point in entry_points(group=GROUP):
         try:

@@ -8,11 +8,12 @@ from types import SimpleNamespace
 
 import pytest
 
+from groma._counted import duration
 from groma.cli.main import run
 from groma.cli.shared import progress as _progress
 from groma.cli.shared import style
 from groma.cli.shared.console import Console
-from groma.cli.shared.progress import Plan, parts_done, say_seconds, screen_line
+from groma.cli.shared.progress import Plan, parts_done, screen_line
 
 
 def be_terminal(monkeypatch):
@@ -28,7 +29,7 @@ def be_terminal(monkeypatch):
     [(0.2, "0 s"), (59.4, "59 s"), (125, "2 min 5 s"), (3600, "1 h 0 min"), (11_430, "3 h 10 min")],
 )
 def test_lengths_of_time(seconds, words):
-    assert say_seconds(seconds) == words
+    assert duration(seconds) == words
 
 
 def test_parts_and_the_time_left():

@@ -71,7 +71,7 @@ def test_stages_begin_where_they_begin():
     tree = _tree(_charts.convergence(rows, stages))
     assert len(list(tree.iter("circle"))) == 5
     assert [path.get("d").count("L") for path in tree.iter("path")] == [2, 1]
-    assert {"cauchy", "geman mcclure"} <= {text.text for text in tree.iter("text")}
+    assert {"Cauchy", "Geman-McClure"} <= {text.text for text in tree.iter("text")}
 
 
 @pytest.mark.parametrize("values", [[], [2], [2, 3, 3], [5] * 10, list(range(2, 200))])

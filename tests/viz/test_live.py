@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """``groma view --live``: what the page says and draws before, while and after a track runs."""
 
+import os
 import shutil
+import time
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
@@ -42,6 +44,10 @@ def test_a_track_from_waiting_to_finished(tmp_path, scene):
         view.refresh()
         assert view.state == live.RUNNING
         assert view.scene is None
+        (work / "statuses.txt").write_text("")
+        os.utime(work / "statuses.txt", (time.time() - 7500.0,) * 2)
+        view.refresh()
+        assert "Nothing new for 2 h 5 min." in view._words.content
         (work / "frames.txt").write_text(ROW.format(0.0, 0.0, 0) + ROW.format(0.1, 0.5, 0))
         write_scene(scene, work / "scene.npz")
         assert view.refresh()
@@ -113,6 +119,7 @@ def test_the_panel_of_a_running_track(tmp_path, scene):
         assert view.picture.visible and view.timeline.visible and view.statuses is not None
         assert "**weak**" in view._words.content
         assert view._now.position.tolist() == [0.1, 0, 4]  # the last frame
+        assert view._now.scale == pytest.approx(1.5 * view._nodes["keyframes"][0].scale)
         view.frame_shown.value = 2
         assert view._now.position.tolist() == [0.1, 0, 1]
         (work / "frames.txt").write_text("".join(ROW.format(0.1 * k, float(k), 0) for k in range(6)))

@@ -90,6 +90,7 @@ def test_numbers_and_warnings_are_shown(tmp_path):
         "12 points",
         "4 lines",
         "1 plane,",
+        "steps of the cameras",
     ):
         assert words in text
 

@@ -59,8 +59,8 @@ class Wanted:
     sigma0: Annotated[
         float,
         RESULTS.option(
-            "With --covariance: the measurement noise in units of the assumed one: 1 pixel; where observations have "
-            "weights, as in maps, what their residuals show.",
+            "With --covariance: factor on the assumed measurement noise, which is 1 pixel, or estimated from the "
+            "residuals where observations have weights, as in maps.",
             metavar="S",
         ),
     ] = 1.0

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Any, Self
 
+from groma._counted import duration
 from groma.cli.shared.style import can_rewrite, has_colours, paint, terminal_width
 
 #: Seconds between two lines where lines cannot be rewritten; characters of a full bar and of the shortest.
@@ -132,7 +133,7 @@ def parts_done(stage: str, done: int, total: int, seconds: float, first: int = 0
     if total <= 1:
         return f"{done:,}" if total == 0 and done else ""
     told = first < done < total and seconds > _EARLY
-    return f"{done:,}/{total:,}" + (f", {say_seconds(seconds * (total - done) / (done - first))} left" if told else "")
+    return f"{done:,}/{total:,}" + (f", {duration(seconds * (total - done) / (done - first))} left" if told else "")
 
 
 def _functions_compiled() -> tuple[int, ...]:
@@ -164,12 +165,3 @@ def _can_say(text: str) -> bool:
     except UnicodeEncodeError:
         return False
     return True
-
-
-def say_seconds(seconds: float) -> str:
-    """Return a duration in at most two units: ``40 s``, ``2 min 5 s``, ``3 h 10 min``."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    minutes, rest = divmod(whole, 60)
-    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"

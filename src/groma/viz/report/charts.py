@@ -17,6 +17,8 @@ from groma.viz.report import digits as _digits
 WIDTH, HEIGHT = 560, 250
 #: Images shown in the bar chart.
 MAX_BARS = 24
+#: Losses named after people.
+_LOSSES = {name.lower().replace("-", "_"): name for name in ("Cauchy", "Geman-McClure", "Huber", "Tukey", "Barron")}
 _LEFT, _RIGHT, _TOP, _BOTTOM = 58, 12, 10, 40
 
 
@@ -132,7 +134,7 @@ def convergence(history: Sequence[Any], stages: Sequence[Mapping[str, Any]] = ()
         for stage in stages:
             x = place(max(first, stage["first_step"] - 1), 10**low)[0]
             body.append(line(x, _TOP, x, bottom, "grid"))
-            body.append(text(x + 5, _TOP + 10, str(stage["loss"]).replace("_", " "), "start"))
+            body.append(text(x + 5, _TOP + 10, _LOSSES.get(stage["loss"], str(stage["loss"])), "start"))
     for stage in sorted({row.get("stage", 1) for row in rows}):
         mine = [row for row in rows if row.get("stage", 1) == stage]
         taken = [place(int(row["iteration"]), float(row["cost"])) for row in mine if row["accepted"]]

@@ -23,6 +23,16 @@ from groma.viz.statistics import images_of
 #: Planes, and directions, in the tables.
 MAX_LISTED_PLANES = 15
 MAX_LISTED_DIRECTIONS = 8
+#: Words for the stages of a solve.
+_STAGES = {
+    "setup": "setting up",
+    "linearize": "residuals and derivatives",
+    "schur": "eliminating landmarks",
+    "solve": "steps of the cameras",
+    "backsubstitute": "steps of the landmarks",
+    "cost": "costs of trial steps",
+    "total": "total",
+}
 #: Words and colours of the outcomes of segments.
 _OUTCOMES = {
     "mapped": ("observes a line", "var(--line)"),
@@ -145,8 +155,8 @@ def number_tables(scene: Scene, before: Drawable | None, after: Drawable, number
     rows = [[name, f"{count:,}"] for name, count in counts_of(scene, after) if count]
     text += table("Scene", "What it holds.", ["", "number"], rows)
     if numbers is not None:
-        seconds = [[name, f"{value:.3f} s"] for name, value in numbers["seconds"].items() if name != "total"]
-        seconds.append(["total", f"{numbers['seconds']['total']:.3f} s"])
+        spent = numbers["seconds"]
+        seconds = [[words, f"{spent[name]:.3f} s"] for name, words in _STAGES.items() if name in spent]
         text += table(
             "Time",
             "Where the last adjustment spent it; the first run on a machine compiles, too.",

@@ -117,6 +117,6 @@ def timeline(statuses: Statuses) -> str:
         if name in statuses.status
     )
     return (
-        f'<div style="padding:0 1em;font-size:.8em"><svg width="100%" height="{_HEIGHT + 6}">{"".join(bars)}</svg>'
+        f'<div style="padding:0 1em .5em;font-size:.8em"><svg width="100%" height="{_HEIGHT + 6}">{"".join(bars)}</svg>'
         f"{key}; height: points and lines that agree; ticks: keyframes</div>"
     )

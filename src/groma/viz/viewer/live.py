@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from groma._counted import counted
+from groma._counted import counted, duration
 from groma._typing import FloatArray
 from groma.bounded.text import finite, read_words
 from groma.errors import GromaError
@@ -123,15 +123,15 @@ class LiveView:
         return changed
 
     def _files(self, running: bool) -> dict[str, Callable[[Path], None]]:
-        """Return the function that draws each file, by name."""
+        """Return the function that draws each file, by name; the scene first, whose size is that of the cameras."""
         scene: dict[str, Callable[[Path], None]] = {"scene.npz": lambda path: self._draw_scene(read_scene(path))}
         if not running:
-            return {"trajectory.txt": lambda path: self._draw_path(read_tum(path).world_from_cam), **scene}
+            return {**scene, "trajectory.txt": lambda path: self._draw_path(read_tum(path).world_from_cam)}
         return {
+            **scene,
             "frames.txt": lambda path: self._draw_path(read_frames(path)),
             "statuses.txt": lambda path: self._show_statuses(read_statuses(path)),
             "now.npz": lambda path: self._show_picture(read_now(path)),
-            **scene,
         }
 
     def _is_new(self, path: Path) -> bool:
@@ -244,7 +244,7 @@ class LiveView:
         if self.state == RUNNING and self._seen:
             silence = time.time() - max(self._seen.values()) * 1e-9
             if silence > QUIET:
-                lines = f"**Nothing new for {silence:.0f} s.** The track may have been stopped."
+                lines = f"**Nothing new for {duration(silence)}.** The track may have been stopped."
         if self.statuses is not None and len(self.statuses) and self.state == RUNNING:
             lines += f"\n\n{self.statuses.sentence()}"
         if self.scene is not None:
