@@ -11,7 +11,11 @@ from groma.io.pose_conventions import POSE_CONVENTIONS, PoseConvention
 
 HEAD = ("file", "rotation and shift take", "rotation", "place", "camera axes")
 _DIRECTIONS = {"cam_from_world": "world to camera", "world_from_cam": "camera to world"}
-_AXES = {"ours": "x right, y down, z forward", "OpenGL": "x right, y up, looking along -z"}
+_AXES = {
+    "ours": "x right, y down, z forward",
+    "OpenGL": "x right, y up, looking along -z",
+    "LLFF": "x down, y right, looking along -z",
+}
 
 
 def cells(convention: PoseConvention) -> tuple[str, ...]:

@@ -102,6 +102,14 @@ def test_what_is_said_without_a_model_depends_on_what_is_missing(tmp_path, monke
     assert "No 3 of them are linked" in colmap_sfm._why_none(44_258, 513, 4, 2)
 
 
+def test_all_images_that_pycolmap_cannot_read_are_named_at_once(tmp_path):
+    names = [f"{letter}.webp" for letter in "abc"]
+    for name in names:
+        (tmp_path / name).write_bytes(b"no image")
+    with pytest.raises(InputError, match=rf"cannot read 3 images in .*: {', '.join(names)}\. Convert"):
+        reconstruct_points(tmp_path, tmp_path / "work", names)
+
+
 def test_images_are_linked_by_pairs_of_many_matches(tmp_path):
     pycolmap = load_pycolmap()
     with colmap_sfm._opened(pycolmap, tmp_path / "database.db") as content:

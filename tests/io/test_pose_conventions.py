@@ -21,7 +21,9 @@ def test_a_camera_written_by_the_words_of_the_table(convention):
     """Rows of the file's rotation are the file's camera axes in the world, or columns, and nothing else is needed."""
     right, down, forward = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
     center, point = np.array([3.0, -2.0, 5.0]), np.array([1.0, 7.0, -4.0])
-    axes = np.array([right, down, forward] if convention.axes == "ours" else [right, -down, -forward])
+    axes = np.array({
+        "ours": [right, down, forward], "OpenGL": [right, -down, -forward], "LLFF": [down, right, -forward]
+    }[convention.axes])  # fmt: skip
     matrix = axes if convention.direction == "cam_from_world" else axes.T
     is_shift = convention.place == "shift" and convention.direction == "cam_from_world"
     place = -axes @ center if is_shift else center

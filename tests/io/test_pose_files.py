@@ -123,6 +123,33 @@ def test_poses_in_whole_numbers_are_no_counts_of_a_model(tmp_path, rows):
     np.testing.assert_array_equal(found.cam_from_world[:, 4], [0, -1, -2])
 
 
+def test_rows_of_llff_in_the_order_of_names_character_by_character(tmp_path, scene):
+    """Columns down, right and backwards of each camera, its centre, height, width and focal length, then two depths."""
+    right, down, forward = np.moveaxis(quaternion.to_matrix(scene.cam_from_world[:, :4]), 1, 0)
+    center = se3.inverse(scene.cam_from_world)[:, 4:]
+    size = np.tile([60.0, 80.0, 50.0], (COUNT, 1))
+    matrices = np.stack([down, right, -forward, center, size], axis=2)
+    rows = np.hstack([matrices.reshape(COUNT, 15), np.tile([1.0, 9.0], (COUNT, 1))])
+    path, order = tmp_path / "poses_bounds.npy", sorted(range(COUNT), key=NAMES.__getitem__)
+    np.save(path, rows[order])
+    found = read_poses(path, NAMES)
+    agree(found, [NAMES[row] for row in order], scene.cam_from_world[order])
+    assert found.cameras is not None and found.cameras.params_of(0).tolist() == [50.0, 40.0, 30.0]
+    assert found.cameras.width.tolist() == [80] and found.camera_idx.tolist() == [0] * COUNT
+    assert "in the order of their names" in found.sentences[0]
+    with pytest.raises(InputError, match="6 poses without names, and there are 5 photographs"):
+        read_poses(path, NAMES[1:])
+    for wrong, words in (
+        (rows[:, :15], "N x 17 numbers, as poses_bounds.npy of LLFF and NeRF; got 6 x 15"),
+        (np.where(rows == 60.0, np.nan, rows), "missing or infinite"),
+        (np.where(rows == 60.0, 60.5, rows), "in whole pixels"),
+        (np.where(rows == 50.0, 0.0, rows), "positive focal lengths"),
+    ):
+        np.save(path, wrong)
+        with pytest.raises(FileFormatError, match=words):
+            read_poses(path, NAMES)
+
+
 def test_axes_that_mirror_and_other_files_are_refused(tmp_path, scene):
     write_scene(scene, tmp_path / "transforms.json")
     document = json.loads((tmp_path / "transforms.json").read_text())

@@ -8,7 +8,9 @@ from _sequences import POINTS, blob_center, blob_image
 
 from groma import cameras
 from groma.errors import InputError
+from groma.io import write_archive, write_colmap
 from groma.io.sequences import SequenceCamera, calibration_of, open_sequence
+from groma.scene import Cameras, Scene
 
 
 def test_a_camera_takes_lists_and_keeps_an_array_of_its_own():
@@ -170,6 +172,26 @@ def test_a_fisheye_of_orb_slam(tmp_path):
     found = calibration_of(path)
     assert (found.model, found.size, found.depth_scale) == ("OPENCV_FISHEYE", (64, 48), None)
     assert found.params.tolist() == [50, 51, 32.5, 24.5, -0.2, 0.05, 0.001, 0.002]
+
+
+def test_the_camera_of_a_map(tmp_path):
+    """A camera that nobody knows is estimated by mapping some of the frames; the message without one says so."""
+    camera = Cameras.of([3], ["SIMPLE_RADIAL"], [[50.0, 32.0, 24.0, -0.1]], [(64, 48)])
+    pose = np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]])
+    scene = Scene.from_images(camera, ["a.png"], np.zeros(1, int), pose)
+    write_colmap(scene, tmp_path / "map")
+    write_archive(scene, tmp_path / "scene.npz")
+    for source in (str(tmp_path / "map"), tmp_path / "scene.npz"):
+        found = calibration_of(source)
+        assert (found.model, found.size) == ("SIMPLE_RADIAL", (64, 48))
+        assert found.params.tolist() == [50, 32, 24, -0.1]
+    two = Cameras.of([3, 4], ["SIMPLE_RADIAL"] * 2, [[50.0, 32.0, 24.0, -0.1]] * 2, [(64, 48)] * 2)
+    write_archive(Scene.from_images(two, ["a.png", "b.png"], np.arange(2), pose[[0, 0]]), tmp_path / "two.npz")
+    with pytest.raises(InputError, match="has 2 cameras; expected one"):
+        calibration_of(tmp_path / "two.npz")
+    (tmp_path / "a.png").write_bytes(b"")
+    with pytest.raises(InputError, match="groma map estimates it from some of the images"):
+        open_sequence(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,8 @@
 
 A file holds a rotation and a place. The rotation takes the world to the camera or the camera to the world; the place is
 the shift that goes with it, or the camera centre (from the camera to the world, both are the same). The camera has our
-axes (x right, y down, z forward) or those of OpenGL (x right, y up, looking along -z).
+axes (x right, y down, z forward), those of OpenGL (x right, y up, looking along -z) or those of LLFF (x down, y right,
+looking along -z).
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ class PoseConvention:
     #: How the rotation is written; quaternions by the order of their numbers.
     rotation: Literal["matrix", "axis and angle", "qx qy qz qw", "qw qx qy qz"]
     place: Literal["shift", "camera centre"]
-    axes: Literal["ours", "OpenGL"] = "ours"
+    axes: Literal["ours", "OpenGL", "LLFF"] = "ours"
 
     def cam_from_world(self, rotation: FloatArray, place: FloatArray) -> FloatArray:
         """Return poses (N, 7) [qx qy qz qw tx ty tz] of rotations and places (N, 3), as the file has them.
@@ -45,6 +46,9 @@ class PoseConvention:
         if self.axes == "OpenGL":
             half_turn = np.array([1.0, 0.0, 0.0, 0.0])  # by pi about x, which is FLIP
             turn, shift = quaternion.multiply(half_turn, turn), FLIP * shift
+        elif self.axes == "LLFF":
+            half_turn = np.sqrt([0.5, 0.5, 0.0, 0.0])  # by pi about (1, 1, 0): exchanges x and y
+            turn, shift = quaternion.multiply(half_turn, turn), shift[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
         return np.hstack([turn, shift])
 
     def quaternions(self, rotation: FloatArray) -> FloatArray:
@@ -60,6 +64,7 @@ COLMAP = PoseConvention("COLMAP, text and binary", "cam_from_world", "qw qx qy q
 TRANSFORMS = PoseConvention(
     "transforms.json: nerfstudio, instant-ngp", "world_from_cam", "matrix", "camera centre", "OpenGL"
 )
+LLFF = PoseConvention("poses_bounds.npy: LLFF, NeRF", "world_from_cam", "matrix", "camera centre", "LLFF")
 OPENSFM = PoseConvention("reconstruction.json: OpenSfM, OpenDroneMap", "cam_from_world", "axis and angle", "shift")
 OPENMVG = PoseConvention("sfm_data.json: OpenMVG", "cam_from_world", "matrix", "camera centre")
 MESHROOM = PoseConvention("cameras.sfm: Meshroom", "world_from_cam", "matrix", "camera centre")
@@ -79,6 +84,6 @@ G2O = PoseConvention("g2o: VERTEX_SE3:QUAT id x y z qx qy qz qw", "world_from_ca
 
 #: All of them, as the documentation lists them.
 POSE_CONVENTIONS = (
-    COLMAP, TRANSFORMS, OPENSFM, OPENMVG, MESHROOM, METASHAPE, NVM, NVM_MATRIX, BUNDLER, BAL, NAMED, TUM, KITTI, LOG,
-    EUROC, G2O,
+    COLMAP, TRANSFORMS, LLFF, OPENSFM, OPENMVG, MESHROOM, METASHAPE, NVM, NVM_MATRIX, BUNDLER, BAL, NAMED, TUM, KITTI,
+    LOG, EUROC, G2O,
 )  # fmt: skip

@@ -10,6 +10,7 @@ a trajectory of KITTI                            in order, if there are as many;
                                                  lines, from 0
 a pose graph of g2o                              the numbers in the names are ids; else in order, if there are as many
 lines ``name x y z qx qy qz qw``                 by name, as of a model
+``poses_bounds.npy`` of LLFF and NeRF            in order of the names, character by character, if there are as many
 ===============================================  ===================================================================
 
 Anything else is refused. Conclusions that are not in the file are returned as sentences.
@@ -22,7 +23,7 @@ import posixpath
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,8 @@ from groma.bounded.text import read_lines
 from groma.errors import InputError
 from groma.geometry import se3
 from groma.io.g2o import looks_like_g2o, read_g2o
+from groma.io.interchange.calibration import camera_table, shared
+from groma.io.interchange.llff import MAGIC, read_llff
 from groma.io.pose_conventions import NAMED
 from groma.io.reading import existing, reading
 from groma.io.registry import HEAD_BYTES, formats, read_scene
@@ -87,6 +90,8 @@ def read_poses(path: str | os.PathLike[str], photographs: Sequence[str]) -> Pose
             head = file.read(HEAD_BYTES)
     if place.is_dir() or any(one.recognise is not None and one.recognise(place, head) for one in formats()):
         return _of_model(place, photographs)
+    if head.startswith(MAGIC):
+        return _of_llff(place, photographs)
     first = b""
     with reading(place, "file of poses"):
         first = next((line for _, line in read_lines(place)), "").encode()
@@ -154,6 +159,23 @@ def _of_measured(place: Path, photographs: Sequence[str]) -> PosesOfPhotographs:
     rows = [row for row, name in enumerate(found) if name is not None]
     poses = NAMED.cam_from_world(given.world_from_cam[rows, 3:], given.world_from_cam[rows, :3])
     return _without_calibration([str(found[row]) for row in rows], poses, said)
+
+
+def _of_llff(place: Path, photographs: Sequence[str]) -> PosesOfPhotographs:
+    poses, of_photograph = read_llff(place)
+    names = sorted(photographs)
+    if len(poses) != len(names):
+        raise InputError(
+            f"{place} holds {counted(len(poses), 'poses')} without names, and there are "
+            f"{counted(len(names), 'photographs')}: it cannot be told which is whose. Keep only the photographs with a "
+            "pose, or pass a file with names (transforms.json, or the COLMAP model that it was made from)."
+        )
+    calibrations, camera_idx = shared(of_photograph)
+    return replace(
+        _in_order(place, names, poses),
+        cameras=camera_table(calibrations, place),
+        camera_idx=np.array(camera_idx, np.int64),
+    )
 
 
 def _of_graph(place: Path, photographs: Sequence[str]) -> PosesOfPhotographs:

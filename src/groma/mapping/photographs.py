@@ -365,19 +365,28 @@ def check_images(
     sizes = {} if model is None else _sizes(model)
     used = names if model is None else model.images.names
     work = [(folder / name, sizes.get(name, (0, 0))) for name in used]
-    return dict(zip(used, map_work(_check_image, work, partial(say, "checking images")), strict=True))
+    found = dict(zip(used, map_work(_check_image, work, partial(say, "checking images")), strict=True))
+    wrong = {name: said for name, said in found.items() if isinstance(said, str)}
+    if wrong:
+        first, *others = wrong
+        more = f" Of {len(used):,} images {len(others):,} more cannot be used: {first_of(others, 9)}." if others else ""
+        raise InputError(wrong[first] + more)
+    return {name: size for name, size in found.items() if not isinstance(size, str)}
 
 
-def _check_image(image: tuple[Path, tuple[int, int]]) -> tuple[int, int]:
-    """Check that an image can be read and has the size of its camera, where that is known; return its own."""
+def _check_image(image: tuple[Path, tuple[int, int]]) -> tuple[int, int] | str:
+    """Return the size of an image; if it cannot be read or is not that of its camera, where known, say so."""
     path, size = image
-    height, width = read_gray(path).shape
+    try:
+        height, width = read_gray(path).shape
+    except InputError as error:
+        return str(error)
     if size in ((0, 0), (width, height)):
         return width, height
     remedy = "Pass the images the model was made from."
     if size == (height, width):
         remedy = "It is turned by 90 degrees: pass the images as they were stored when the model was made."
-    raise InputError(f"{path} has {width}x{height} pixels, its camera {size[0]}x{size[1]}. {remedy}")
+    return f"{path} has {width}x{height} pixels, its camera {size[0]}x{size[1]}. {remedy}"
 
 
 def _sizes(model: Scene) -> dict[str, tuple[int, int]]:

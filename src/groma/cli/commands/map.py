@@ -38,8 +38,9 @@ def map_(
     poses: Annotated[
         Path | None,
         _options.CAMERAS.option(
-            "Poses without points: a model, transforms.json, reconstruction.json, a trajectory (TUM, KITTI), a g2o "
-            "graph, or lines name x y z qx qy qz qw. Points are triangulated, poses refined, wrong ones reported.",
+            "Poses without points: a model, transforms.json, reconstruction.json, poses_bounds.npy, a trajectory (TUM, "
+            "KITTI), a g2o graph, or lines name x y z qx qy qz qw. Points are triangulated, poses refined, wrong ones "
+            "reported.",
             metavar="FILE",
         ),
     ] = None,

@@ -30,8 +30,9 @@ def track(
     camera: Annotated[
         str | None,
         _options.CAMERAS.option(
-            "Calibration file (also YAML of Kalibr, ROS, OpenCV or ORB-SLAM, JSON of Open3D or Replica), or parameters "
-            "in OpenCV's order: fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]]. Default: that of the sequence.",
+            "Calibration file (also YAML of Kalibr, ROS, OpenCV or ORB-SLAM, JSON of Open3D or Replica), the OUT of "
+            "groma map, or parameters in OpenCV's order: fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]]. Default: that of "
+            "the sequence.",
             metavar="CAMERA",
         ),
     ] = None,

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from groma import cameras as camera_models
-from groma._counted import counted
+from groma._counted import counted, first_of
 from groma.errors import GromaError, InputError, OutputError, did_you_mean
 from groma.io.colmap.large_photographs import features_of_large
 from groma.io.colmap.load import load_pycolmap
@@ -227,14 +227,19 @@ def _enter_images(pycolmap: Any, database: Path, images: Path, names: list[str],
         with _opened(pycolmap, database):
             pass
     groups: dict[tuple[Any, ...], list[str]] = {}
+    unread = []
     for name in names:
         bitmap = pycolmap.Bitmap.read(str(images / name), False)
         if bitmap is None:
-            raise InputError(
-                f"{images / name} cannot be read by pycolmap, which finds the points. Convert it to JPEG or PNG."
-            )
+            unread.append(name)
+            continue
         key = (bitmap.width, bitmap.height, bitmap.exif_camera_model(), camera_of(options.rigs, name))
         groups.setdefault(key, []).append(name)
+    if unread:
+        raise InputError(
+            f"pycolmap, which finds the points, cannot read {counted(len(unread), 'images')} in {images}: "
+            f"{first_of(unread, 9)}. Convert to JPEG or PNG."
+        )
     if options.camera_params is not None and len({key[:3] for key in groups}) > 1:
         sizes = ", ".join(sorted({f"{key[0]}x{key[1]}" for key in groups}))
         raise InputError(

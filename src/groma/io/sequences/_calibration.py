@@ -23,6 +23,7 @@ from groma.bounded.documents import member, number, of_kind, read_document, size
 from groma.bounded.text import finite, is_number, read_text, whole
 from groma.errors import FileFormatError, InputError
 from groma.io.reading import reading
+from groma.io.registry import read_scene
 from groma.io.sequences._yaml import yaml_entries, yaml_numbers
 from groma.io.sequences.frame import SequenceCamera, checked_params
 
@@ -39,8 +40,8 @@ _BAND = 1 << 18
 
 _HELP = (
     "expected 'fx fy cx cy', 'fx fy cx cy k1 k2 p1 p2 [k3 [k4 k5 k6]]', a 3x3 or 4x4 matrix, a line of COLMAP's "
-    "cameras.txt ('1 PINHOLE 640 480 fx fy cx cy'), a .yaml file of Kalibr, ROS, OpenCV or ORB-SLAM, or a .json file "
-    "of Open3D or Replica"
+    "cameras.txt ('1 PINHOLE 640 480 fx fy cx cy'), a .yaml file of Kalibr, ROS, OpenCV or ORB-SLAM, a .json file "
+    "of Open3D or Replica, or a COLMAP model or map of one camera"
 )
 
 
@@ -137,7 +138,9 @@ def calibration_of(camera: CameraLike) -> Calibration:
 
 
 def read_calibration(path: Path) -> Calibration:
-    """Read a calibration from a file in one of the accepted forms."""
+    """Read a calibration from a file in one of the accepted forms, or from a model of one camera."""
+    if path.is_dir() or path.suffix.lower() == ".npz":
+        return _of_model(path)
     with reading(path, "camera file"):
         if path.suffix.lower() in (".yaml", ".yml"):
             return calibration_in(yaml_entries(path), path)
@@ -195,6 +198,14 @@ def _of_orb_slam(entries: dict[str, str], name: str, path: Path) -> Calibration:
         found = from_opencv(numbers, (wide, high))
     factor = entries.get("RGBD.DepthMapFactor", entries.get("DepthMapFactor", "0"))
     return replace(found, depth_scale=finite([factor], f"{path}, DepthMapFactor")[0] or None)
+
+
+def _of_model(path: Path) -> Calibration:
+    """Return the camera of a COLMAP model, an archive or a map, if it has one."""
+    known = read_scene(path).cameras
+    if len(known) != 1:
+        raise InputError(f"{path} has {len(known)} cameras; expected one. Pass the numbers of the one of the sequence.")
+    return _checked(known.models[0], known.params_of(0), (int(known.width[0]), int(known.height[0])), str(path))
 
 
 def _from_document(document: Any, path: Path) -> Calibration:

@@ -51,7 +51,8 @@ def camera_for(place: Path, wishes: Wishes, *folders: Path) -> Calibration:
     if found is None:
         raise InputError(
             f"No camera is known for {place}. Pass one (--camera), such as 'fx fy cx cy', or the name of a file with a "
-            "line of COLMAP's cameras.txt, or put it into cameras.txt beside the images."
+            "line of COLMAP's cameras.txt, or put it into cameras.txt beside the images. If it is unknown, groma map "
+            "estimates it from some of the images: pass its OUT (--camera OUT)."
         )
     return found
 
