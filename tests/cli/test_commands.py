@@ -54,6 +54,25 @@ def test_page_of_an_adjustment_shows_the_photographs(scenes, here):
         assert (here / "p.html").read_text().count("data:image/jpeg") == number
 
 
+def test_the_photographs_of_a_project_are_its_images(scenes, here, capsys):
+    """Masks and depths beside them are none; a picture in the folder, or a model of its names, says otherwise."""
+    for kind in ("images", "masks", "depth"):
+        (here / "site" / kind).mkdir(parents=True)
+        for number in range(2):
+            cv2.imwrite(str(here / "site" / kind / f"{number}.png"), np.full((60, 80), 90 + number, np.uint8))
+    assert run(["map", "site", "-o", "out"]) == 1
+    said = capsys.readouterr()
+    assert f"Photographs: {os.path.join('site', 'images')};" in said.out and "holds 2 images" in said.err
+    scene = read_scene(scenes / "points.npz")
+    names = ("images/0.png", *scene.images.names[1:])
+    write_scene(scene.replace(images=scene.images.replace(names=names)), here / "model.npz")
+    assert run(["map", "site", "--model", "model.npz", "-o", "out"]) == 1
+    assert "Photographs:" not in capsys.readouterr().out
+    cv2.imwrite("site/0.png", np.full((60, 80), 30, np.uint8))
+    assert run(["map", "site", "-o", "out", "--min-length", "20"]) == 1
+    assert "Photographs:" not in capsys.readouterr().out
+
+
 @pytest.mark.compiled
 @pytest.mark.parametrize("form", ["bearing", "normal"])
 def test_adjust_by_other_residuals_of_lines(scenes, here, form):
