@@ -5,6 +5,7 @@ import json
 import os
 
 import _comparison as compare
+import cv2
 import numpy as np
 import pytest
 
@@ -37,6 +38,39 @@ def test_adjust(scenes, here, capsys):
     assert stages <= set(report["seconds"])
     assert read_scene(here / "out.npz").num_points == start.num_points
     assert sorted(os.listdir(here)) == ["out.npz", "p.html", "r.json"]
+
+
+def test_page_of_an_adjustment_shows_the_photographs(scenes, here):
+    """They are found where ``groma view`` finds them: here in the folder that ``summary.json`` names."""
+    scene = read_scene(scenes / "points.npz")
+    (here / "photos").mkdir()
+    for name in scene.images.names:
+        cv2.imwrite(str(here / "photos" / f"{name}.png"), np.full((60, 80), 90, np.uint8))
+    names = tuple(f"{name}.png" for name in scene.images.names)
+    write_scene(scene.replace(images=scene.images.replace(names=names)), here / "map")
+    for photographs, number in (("../photos", len(names)), ("elsewhere", 0)):
+        (here / "map" / "summary.json").write_text(json.dumps({"images": photographs}))
+        assert run(["adjust", "map", "--max-iterations", "1", "--report", "p.html", "--force", "--quiet"]) == 0
+        assert (here / "p.html").read_text().count("data:image/jpeg") == number
+
+
+def test_the_photographs_of_a_project_are_its_images(scenes, here, capsys):
+    """Masks and depths beside them are none; a picture in the folder, or a model of its names, says otherwise."""
+    for kind in ("images", "masks", "depth"):
+        (here / "site" / kind).mkdir(parents=True)
+        for number in range(2):
+            cv2.imwrite(str(here / "site" / kind / f"{number}.png"), np.full((60, 80), 90 + number, np.uint8))
+    assert run(["map", "site", "-o", "out"]) == 1
+    said = capsys.readouterr()
+    assert f"Photographs: {os.path.join('site', 'images')};" in said.out and "holds 2 images" in said.err
+    scene = read_scene(scenes / "points.npz")
+    names = ("images/0.png", *scene.images.names[1:])
+    write_scene(scene.replace(images=scene.images.replace(names=names)), here / "model.npz")
+    assert run(["map", "site", "--model", "model.npz", "-o", "out"]) == 1
+    assert "Photographs:" not in capsys.readouterr().out
+    cv2.imwrite("site/0.png", np.full((60, 80), 30, np.uint8))
+    assert run(["map", "site", "-o", "out", "--min-length", "20"]) == 1
+    assert "Photographs:" not in capsys.readouterr().out
 
 
 @pytest.mark.compiled

@@ -25,7 +25,12 @@ if TYPE_CHECKING:
 @led_by_first_rank
 def map_(
     console: Console,
-    images: Annotated[Path, typer.Argument(metavar="IMAGES", help="Folder of photographs, and of folders of them.")],
+    images: Annotated[
+        Path,
+        typer.Argument(
+            metavar="IMAGES", help="Folder of photographs, and of folders of them; or a project with a folder images."
+        ),
+    ],
     output: Annotated[Path, _options.PLAIN.option("Folder for the results.", "--output", "-o", metavar="OUT")],
     model: Annotated[
         Path | None,
@@ -166,6 +171,7 @@ def map_(
     if not _has_noise(poses, measured.pose_sigma):
         measured = replace(measured, poses=None)
     check_inputs(images, model, poses, rig, line_matches, truth, extend, map_images, depth, *measured.files)
+    images = _photographs_of(console, images, model)
     maps = _depth.depth_maps(depth, depth_scale, relative_depth, images)
     known = {"--model": model, "--poses": poses, "--rig": rig, "--camera-params": camera_params, "--depth": depth}
     check_extension(extend, map_images, known)
@@ -237,6 +243,21 @@ def map_(
     say_map(console, result, numbers)
     console.wrote_page(output)
     _output.write_json(console.json_target, numbers, force)
+
+
+def _photographs_of(console: Console, folder: Path, model: Path | None) -> Path:
+    """Return the folder ``images`` of a project, whose masks and depths are no photographs; else the folder itself."""
+    from groma.bounded.names import IMAGES
+    from groma.io import read_scene
+    from groma.io.colmap.rigs import RIG_FILE
+
+    inner = folder / "images"
+    if not inner.is_dir() or any(path.suffix.lower() in IMAGES or path.name == RIG_FILE for path in folder.iterdir()):
+        return folder
+    if model is not None and any((folder / name).is_file() for name in read_scene(model).images.names):
+        return folder
+    console.say(f"Photographs: {inner}; nothing else in {folder} is taken for one.")
+    return inner
 
 
 def _names_in(folder: Path) -> list[str]:

@@ -42,7 +42,12 @@ class Wanted:
     ] = None
     rolling_shutter: RollingShutter = None
     page: Annotated[
-        Path | None, RESULTS.option("Also write an HTML page: before and after.", "--report", metavar="FILE")
+        Path | None,
+        RESULTS.option(
+            "Also write an HTML page: before and after, with the photographs that groma view finds.",
+            "--report",
+            metavar="FILE",
+        ),
     ] = None
     covariance: Annotated[
         Path | None,
@@ -197,6 +202,7 @@ def _write_page(
     found: SceneUncertainty | None,
 ) -> None:
     """Write the page, before and after; covariances give standard deviations to what is measured on it."""
+    from groma.viz.pictures import folder_of_images
     from groma.viz.report.covariances import LandmarkCovariances, centers_of_images
     from groma.viz.report.page import PageContents, write_report
     from groma.viz.report.survey import survey_card
@@ -214,7 +220,8 @@ def _write_page(
     )
     title = f"Adjustment of {_output.subject(source)}"
     with _output.atomic_output(path, force) as draft:
-        write_report(draft, before, result.scene, result.report, title=title, contents=contents)
+        images = folder_of_images(source, result.scene.images.names)
+        write_report(draft, before, result.scene, result.report, images, title, contents)
 
 
 def _adjusted(
