@@ -8,15 +8,21 @@ from scipy.special import ndtr
 def coverage(vertices, width, height, samples=8):
     """Share of each pixel covered by a convex polygon; vertices count from the corner of the image."""
     vertices = np.asarray(vertices, dtype=np.float64)
-    u, v = (np.arange(width * samples) + 0.5) / samples, (np.arange(height * samples) + 0.5) / samples
-    inside = np.ones((height * samples, width * samples), dtype=bool)
+    # Beside the polygon there is nothing to sample.
+    left, top = np.clip(np.floor(vertices.min(axis=0)), 0, [width, height]).astype(int)
+    right, bottom = np.clip(np.ceil(vertices.max(axis=0)), [left, top], [width, height]).astype(int)
+    u = (np.arange(left * samples, right * samples) + 0.5) / samples
+    v = (np.arange(top * samples, bottom * samples) + 0.5) / samples
+    inside = np.ones((len(v), len(u)), dtype=bool)
     center = vertices.mean(axis=0)
     for start, end in zip(vertices, np.roll(vertices, -1, axis=0), strict=True):
         normal = np.array([start[1] - end[1], end[0] - start[0]])
         if normal @ (center - start) < 0.0:
             normal = -normal
         inside &= (u[None, :] - start[0]) * normal[0] + (v[:, None] - start[1]) * normal[1] >= 0.0
-    return inside.reshape(height, samples, width, samples).mean(axis=(1, 3))
+    share = np.zeros((height, width))
+    share[top:bottom, left:right] = inside.reshape(bottom - top, samples, right - left, samples).mean(axis=(1, 3))
+    return share
 
 
 def rectangle(center, half, angle):

@@ -113,7 +113,7 @@ def test_corridor_has_its_walls_and_directions():
 
 def test_progress_and_what_is_left_out():
     """Every stage is said and goes forward; each direction that is kept is shared by lines."""
-    _, scene = measured("corridor", "small")
+    _, scene = measured("corridor", "tiny")
     said: list[tuple[str, int, int]] = []
     found = find_structure(scene, progress=lambda *event: said.append(event))
     assert list(dict.fromkeys(stage for stage, _, _ in said)) == [
@@ -137,7 +137,7 @@ def test_progress_and_what_is_left_out():
 
 def test_lines_take_part_with_the_noise_that_they_show():
     """With residuals four times the usual ones they are known a quarter as well, and still lie on their walls."""
-    _, scene = measured("corridor", "small")
+    _, scene = measured("corridor", "tiny")
     points, lines = landmark_noise(scene, StructureOptions())
     usual, shown = (find_structure(scene, noise=(points, replace(lines, misfit=one * lines.misfit))) for one in (1, 4))
     assert len(shown.relations.line_on_plane) > 0.8 * len(usual.relations.line_on_plane) > 0
