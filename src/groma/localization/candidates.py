@@ -27,7 +27,7 @@ from groma.localization.map_index import MapIndex
 from groma.localization.matching import match_descriptors, pairs_near
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.hypotheses import max_errors
-from groma.localization.pose.matches import Matches
+from groma.localization.pose.matches import Matches, nearest_claims
 from groma.localization.pose.refinement import Refined, refine
 from groma.scene import Scene
 
@@ -188,18 +188,10 @@ def _points_near(
         query.points.descriptors, reach,
     )  # fmt: skip
     point = index.point[rows[first]]
-    kept = np.flatnonzero(_nearest(second, far, len(query.points)) & _nearest(point, far, len(index.xyz)))
+    every = np.ones(len(far), bool)
+    kept = np.flatnonzero(nearest_claims(second, far, every) & nearest_claims(point, far, every))
     kept = kept[np.argsort(far[kept], kind="stable")]
     return np.column_stack([second[kept], point[kept]]), far[kept]
-
-
-def _nearest(owner: IntArray, far: FloatArray, count: int) -> BoolArray:
-    """Which rows (n,) are the nearest of their owner, of so many; the first of equal ones."""
-    least = np.full(count, np.inf)
-    np.minimum.at(least, owner, far)
-    rows, first = np.flatnonzero(far == least[owner]), np.full(count, len(far))
-    np.minimum.at(first, owner[rows], rows)
-    return first[owner] == np.arange(len(far))
 
 
 @dataclass(eq=False)

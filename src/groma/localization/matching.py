@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from groma._numba import loop
+from groma._numba import loop, unrolled_loop
 from groma._rows import pointers_of
 from groma._typing import FloatArray, IntArray
 from groma.execution import map_ranges
@@ -51,7 +51,7 @@ def _compare_far(alike, row, column, places, pixels, square, top):
         top[row + i] = one
 
 
-@loop
+@unrolled_loop
 def _lengths(descriptors, out):
     for i in range(descriptors.shape[0]):
         square = np.int32(0)
@@ -60,7 +60,7 @@ def _lengths(descriptors, out):
         out[i] = max(np.sqrt(np.float64(square)), 1e-6)
 
 
-@loop
+@unrolled_loop
 def _near(
     expected,
     rows_of_first,
@@ -87,22 +87,23 @@ def _near(
     for i in range(expected.shape[0]):
         u, v, own = expected[i, 0], expected[i, 1], rows_of_first[i]
         column, row = int(np.floor(u / side)) + 1, int(np.floor(v / side)) + 1
+        right = max(min(column + 2, cells[0]), 0)
+        left = min(max(column - 1, 0), right)
         for y in range(max(row - 1, 0), min(row + 2, cells[1])):
-            for x in range(max(column - 1, 0), min(column + 2, cells[0])):
-                for at in range(cell_begin[y * cells[0] + x], cell_begin[y * cells[0] + x + 1]):
-                    k = cell_point[at]
-                    if (pixels[k, 0] - u) ** 2 + (pixels[k, 1] - v) ** 2 > reach * reach:
-                        continue
-                    product = np.int32(0)
-                    for j in range(first.shape[1]):
-                        product += np.int32(first[own, j]) * np.int32(second[k, j])
-                    cosine = product / (first_length[own] * second_length[k])
-                    if cosine < least:
-                        continue
-                    if count < rows.shape[0]:
-                        rows[count], columns[count] = i, k
-                        distance[count] = np.sqrt(max(2.0 - 2.0 * cosine, 0.0))
-                    count += 1
+            for at in range(cell_begin[y * cells[0] + left], cell_begin[y * cells[0] + right]):
+                k = cell_point[at]
+                if (pixels[k, 0] - u) ** 2 + (pixels[k, 1] - v) ** 2 > reach * reach:
+                    continue
+                product = np.int32(0)
+                for j in range(first.shape[1]):
+                    product += np.int32(first[own, j]) * np.int32(second[k, j])
+                cosine = product / (first_length[own] * second_length[k])
+                if cosine < least:
+                    continue
+                if count < rows.shape[0]:
+                    rows[count], columns[count] = i, k
+                    distance[count] = np.sqrt(max(2.0 - 2.0 * cosine, 0.0))
+                count += 1
     return count
 
 

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
+from groma._numba import loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 
@@ -21,6 +23,17 @@ _LEFT_OUT: FloatArray = np.zeros(0)
 _LEFT_OUT.flags.writeable = False
 
 
+# ---------------------------------------------------------------------------------------------------------- Kernels
+@loop
+def _nearest(claim, distance, agrees, nearest):
+    """The agreeing row that is nearest for each claim, the first of equal ones; left as it is where none agrees."""
+    for i in range(claim.shape[0]):
+        other = nearest[claim[i]]
+        if agrees[i] and (other < 0 or distance[i] < distance[other]):
+            nearest[claim[i]] = i
+
+
+# ----------------------------------------------------------------------------------------------------------- Public
 @dataclass(frozen=True, eq=False)
 class Matches:
     """What may be seen of what; several rows may claim one point or one segment of the image.
@@ -88,6 +101,7 @@ class Matches:
         """The same matches with one standard deviation for all, pixels."""
         return replace(self, point_sigma=np.full(self.num_points, sigma), segment_sigma=np.full(self.num_lines, sigma))
 
+    @cached_property
     def claims(self) -> tuple[IntArray, IntArray]:
         """Numbers (N,) and (M,) of what is claimed in the image: equal for rows that claim the same."""
         return _groups(self.points2d), _groups(self.segments2d.reshape(-1, 4))
@@ -109,8 +123,8 @@ def _groups(rows: npt.NDArray[np.float64]) -> IntArray:
 
 def nearest_claims(claim: IntArray, distance: FloatArray, agrees: BoolArray) -> BoolArray:
     """Which of the agreeing rows (N,) are the nearest of those that claim the same: a pixel shows one place."""
-    rows = np.flatnonzero(agrees)
-    rows = rows[np.argsort(distance[rows], kind="stable")]
+    nearest = np.full(int(claim.max(initial=-1)) + 1, -1)
+    _nearest(claim, distance, agrees, nearest)
     kept = np.zeros(len(agrees), bool)
-    kept[rows[np.unique(claim[rows], return_index=True)[1]]] = True
+    kept[nearest[nearest >= 0]] = True
     return kept

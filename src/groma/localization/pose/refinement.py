@@ -285,7 +285,7 @@ def fitted_at(
     near = (points.square <= limit, (lines.square <= limit) & _in_front(camera, matches, one.pose))
     agree = [
         nearest_claims(claim, found.square, inside)
-        for claim, found, inside in zip(matches.claims(), (points, lines), near, strict=True)
+        for claim, found, inside in zip(matches.claims, (points, lines), near, strict=True)
     ]
     return Refined(one.pose, camera, points, lines, agree[0], agree[1], sigma0, limit, one, weights, lens)
 

@@ -10,13 +10,42 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from groma._numba import loop
 from groma._typing import FloatArray
 from groma.localization.pose.one_pose import OnePose
 
 
+# ---------------------------------------------------------------------------------------------------------- Kernels
+@loop
+def _whiten(record, weight, lens, rows, value, by_pose, spread):
+    """Whiten records, those of parameters along the directions of the lens; what cannot be evaluated is left."""
+    last = record.shape[2] - 1
+    for n in range(record.shape[0]):
+        row, seen = rows[n], False
+        for i in range(2):
+            for j in range(last + 1):
+                seen = seen or record[n, i, j] != 0.0
+        a, b, c, d = weight[n, 0, 0], weight[n, 0, 1], weight[n, 1, 0], weight[n, 1, 1]
+        spread[row] = 1.0 / abs(a * d - b * c)
+        if not seen:
+            continue
+        value[row, 0] = a * record[n, 0, last] + b * record[n, 1, last]
+        value[row, 1] = c * record[n, 0, last] + d * record[n, 1, last]
+        for j in range(last):
+            u, v = record[n, 0, j], record[n, 1, j]
+            if j < 6:
+                by_pose[row, 0, j], by_pose[row, 1, j] = a * u + b * v, c * u + d * v
+                continue
+            for k in range(lens.shape[1]):
+                by_pose[row, 0, 6 + k] += (a * u + b * v) * lens[j - 6, k]
+                by_pose[row, 1, 6 + k] += (c * u + d * v) * lens[j - 6, k]
+
+
+# ----------------------------------------------------------------------------------------------------------- Public
 @dataclass(frozen=True, eq=False)
 class Residuals:
     """What a pose leaves of the matches, in standard deviations, and what it says about the pose."""
@@ -28,7 +57,7 @@ class Residuals:
     #: (n,) square pixels of an ellipse of one standard deviation, over pi: root of the determinant of the noise.
     spread: FloatArray
 
-    @property
+    @cached_property
     def square(self) -> FloatArray:
         """(n,) squared lengths; infinite where a match has no image."""
         square = (self.value**2).sum(axis=1)
@@ -49,14 +78,6 @@ def residuals(
     for part, weight in zip(one.parts, weights, strict=True):
         if part.kind != landmarks:
             continue
-        known = more > 0 and part.has_lens
-        record = one.records(part, "pose", *(["lens"] if known else []))
-        white = weight @ record
-        seen = (record != 0.0).any(axis=(1, 2))  # what cannot be evaluated is zero
-        rows = part.row
-        value[rows[seen]] = white[seen, :, -1]
-        by_pose[rows[seen], :, :6] = white[seen][:, :, :6]
-        if known:
-            by_pose[rows[seen], :, 6:] = white[seen][:, :, 6:-1] @ lens
-        spread[rows] = 1.0 / np.abs(weight[:, 0, 0] * weight[:, 1, 1] - weight[:, 0, 1] * weight[:, 1, 0])
+        record = one.records(part, "pose", *(["lens"] if more and part.has_lens else []))
+        _whiten(record, np.ascontiguousarray(weight), lens, part.row, value, by_pose, spread)
     return Residuals(value, by_pose, spread)
