@@ -215,8 +215,7 @@ def swinging(count: int, degrees: float, seed: int, pure: bool = False) -> np.nd
     at = np.abs(length[start] + np.cumsum(speed * way))
     # Twice as many poses as frames: the exposure is in the middle of two.
     fine = np.interp(np.arange(2 * count + 1) / 2.0, np.arange(count) + 0.5, at)
-    rows = np.searchsorted(length, fine).clip(0, len(path) - 1)
-    R = turn[rows]
+    R = turn[np.searchsorted(length, fine).clip(0, len(path) - 1)]
     t = np.arange(2 * count + 1) / 2.0
     center = np.stack([0.25 * np.sin(0.05 * t + phase[5]), 0.05 * np.sin(0.11 * t), 0.2 * np.sin(0.07 * t)], axis=1)
     # The camera is held 15 cm before the axis it turns about.
@@ -277,8 +276,7 @@ class Turning:
     def poses(self) -> np.ndarray:
         """(N, 7) true cam_from_world, in the middle of the exposures."""
         before, after = self.half_poses[:-2:2], self.half_poses[2::2]
-        half = 0.5 * se3.log(se3.compose(after, se3.inverse(before)))
-        return se3.compose(se3.exp(half), before)
+        return se3.compose(se3.exp(0.5 * se3.log(se3.compose(after, se3.inverse(before)))), before)
 
     def __len__(self) -> int:
         return len(self.poses)

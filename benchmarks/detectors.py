@@ -70,8 +70,7 @@ def mapped(source: LineScene, segments: list[Segments]) -> Scene:
             settings = replace(settings, refine_poses=True, detector=Given(iter(segments)))
             return map_images(folder() / "images", work, source.scene, settings).scene
         with Stages(Path(work), source.name, settings) as stages:
-            points = stages.run(adjust_points, source.scene)
-            return map_segments(points, segments, None, stages).scene
+            return map_segments(stages.run(adjust_points, source.scene), segments, None, stages).scene
 
 
 def compared(source: LineScene, scene: Scene) -> dict:

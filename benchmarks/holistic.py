@@ -90,8 +90,7 @@ def errors(result: dict[str, np.ndarray], truth: groma.Scene) -> dict[str, float
     ends, true_ends = moved(result["lines"]), truth.lines.segments
     along = unit(ends[:, 1] - ends[:, 0])
     out["line_deg"] = np.degrees(np.median(np.arcsin(sines(along, unit(true_ends[:, 1] - true_ends[:, 0])))))
-    away = np.cross(true_ends - ends[:, :1], along[:, None])
-    out["line"] = np.median(np.linalg.norm(away, axis=-1))
+    out["line"] = np.median(np.linalg.norm(np.cross(true_ends - ends[:, :1], along[:, None]), axis=-1))
     normal, true_normal = unit(result["planes"][:, :3]) @ rotation.T, truth.planes.hesse[:, :3]
     out["plane_deg"] = np.degrees(np.median(np.arcsin(sines(normal, true_normal))))
     offset = scale * result["planes"][:, 3] / np.linalg.norm(result["planes"][:, :3], axis=1) - normal @ shift
@@ -331,8 +330,7 @@ def main() -> int:
                 for run in one_scene(images, views, seed, arguments.kinds, pythons, kept):
                     runs.add(run)
                 path.write_text(json.dumps({"machine": machine(), "runs": runs.rows}, indent=1) + "\n")
-            here = Runs(runs.of(images=images, views=views))
-            print(table(here), flush=True)
+            print(table(Runs(runs.of(images=images, views=views))), flush=True)
     texts = {"holistic": table(runs), "holistic_accuracy": accuracy_table(runs), "holistic_growth": growth_table(runs)}
     for name, text in texts.items():
         (RESULTS / f"{name}.md").write_text(text)

@@ -86,8 +86,7 @@ def with_poses(scene: Scene, rng: np.random.Generator) -> Scene:
 def drawn_scenes(truth: Scene, drawn: Scene, rng: np.random.Generator) -> dict[str, Scene]:
     """Return one draw of every scene: what holds its frame, and what else was measured."""
     chosen = spread(truth, 2)
-    marked = with_control(drawn, rng, chosen, [UNKNOWN] * 2, 1.0)
-    placed = with_positions(marked, rng)
+    placed = with_positions(with_control(drawn, rng, chosen, [UNKNOWN] * 2, 1.0), rng)
     few = placed.replace(camera_positions=placed.camera_positions.take([0, 10, 20]))
     known = with_distances(with_heights(with_gravity(few, rng, {}), rng), truth.points.xyz[chosen], rng)
     far = int(np.argmax(np.linalg.norm(truth.cam_centers_in_world - truth.cam_centers_in_world[0], axis=1)))

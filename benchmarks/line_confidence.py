@@ -90,8 +90,7 @@ def judged(source: LineScene, cache: Path) -> Judged:
         settings = MapOptions(refine_poses=False, threads=1, min_confidence=0.0)
         segments = source.segments(MIN_LENGTH.get(source.name, settings.lines.min_length))
         with tempfile.TemporaryDirectory() as work, Stages(Path(work), source.name, settings) as stages:
-            points = stages.run(adjust_points, source.scene)
-            result = map_segments(points, segments, None, stages)
+            result = map_segments(stages.run(adjust_points, source.scene), segments, None, stages)
             write_archive(result.scene, file)
             write_archive(result.before, before)
             surface.write_text(repr(float(result.adjusted_with.structure_sigma_px)))

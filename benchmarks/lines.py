@@ -177,8 +177,7 @@ def for_limap(task: Task) -> dict[str, np.ndarray]:
     if any(scene.cameras.models[c] != "PINHOLE" for c in camera):
         raise SystemExit(f"{task.source.name}: LIMAP needs undistorted PINHOLE images.")
     seen, ends = scene.point_observations, [segments.ends for segments in task.segments]
-    widest = max(len(row) for row in task.neighbors)
-    neighbors = np.full((len(ends), widest), -1)
+    neighbors = np.full((len(ends), max(len(row) for row in task.neighbors)), -1)
     for i, row in enumerate(task.neighbors):
         neighbors[i, : len(row)] = row
     pairs = [found.pairs for found in task.matches.values()]

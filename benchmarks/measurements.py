@@ -221,8 +221,7 @@ def one_map(arguments: argparse.Namespace) -> None:
 def aligned_with_scale(source: np.ndarray, target: np.ndarray) -> float:
     from groma.evaluation.alignment import align_points
 
-    off = align_points(source, target).points(source) - target
-    return float(np.sqrt((off**2).sum(axis=1).mean()))
+    return float(np.sqrt(((align_points(source, target).points(source) - target) ** 2).sum(axis=1).mean()))
 
 
 def detection(arguments: argparse.Namespace) -> None:

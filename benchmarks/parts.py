@@ -329,8 +329,7 @@ def main() -> None:
     if arguments.run is not None:
         if arguments.plain_sums:
             sum_plainly()
-        output = arguments.run.parent / f"{arguments.run.name}-adjusted"
-        row = run(arguments.run, arguments, output)
+        row = run(arguments.run, arguments, arguments.run.parent / f"{arguments.run.name}-adjusted")
         if row["rank"] == 0:
             print(json.dumps(row))
         return

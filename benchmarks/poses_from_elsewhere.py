@@ -84,8 +84,7 @@ def draw(folder: Path, work: Path, case: tuple[float, float, float], seed: int, 
     with tempfile.TemporaryDirectory() as place:
         write_scene(given, Path(place) / "transforms.json")
         start = scene_at_poses(folder / "images", Path(place) / "transforms.json", PointModelOptions())
-        placed = place_photographs(folder / "images", work, start.scene, PointModelOptions())
-        scene = placed.scene
+        scene = place_photographs(folder / "images", work, start.scene, PointModelOptions()).scene
         mapped = None
         if with_lines:
             mapped = distances(map_images(folder / "images", Path(place) / "map", scene, MapOptions()).scene, survey)

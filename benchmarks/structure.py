@@ -176,8 +176,7 @@ def _edge_of_lines(scene: Scene, edges: np.ndarray) -> np.ndarray:
     )
     foot = edges[None, :, None, 0] + np.clip(share, 0.0, 1.0)[..., None] * way[None, :, None]
     distance = np.linalg.norm(ends[:, None] - foot, axis=3).max(axis=2)
-    best = distance.argmin(axis=1)
-    return np.where(distance.min(axis=1) < near, best, -1)
+    return np.where(distance.min(axis=1) < near, distance.argmin(axis=1), -1)
 
 
 def _meeting(scene: Scene, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

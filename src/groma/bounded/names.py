@@ -24,8 +24,7 @@ def stays_inside(name: str) -> bool:
     """Whether a name, taken as a path in some folder, can only mean something in that folder."""
     if not name or "\0" in name or os.path.isabs(name) or os.path.splitdrive(name)[0]:
         return False
-    way = os.path.normpath(name).replace(os.sep, "/").split("/")
-    return way[0] not in ("..", "")
+    return os.path.normpath(name).replace(os.sep, "/").split("/")[0] not in ("..", "")
 
 
 def is_text(name: str) -> bool:

@@ -168,8 +168,7 @@ def _wall(rng: np.random.Generator, width: int) -> npt.NDArray[np.uint8]:
         x, y = int(rng.integers(0, width - 20)), int(rng.integers(0, 460))
         w, h = (int(size) for size in rng.integers(8, 90, 2))
         image[y : y + h, x : x + w] = rng.integers(20, 235)
-    noisy = image.astype(np.int16) + rng.integers(-4, 5, image.shape)
-    return noisy.clip(0, 255).astype(np.uint8)
+    return (image.astype(np.int16) + rng.integers(-4, 5, image.shape)).clip(0, 255).astype(np.uint8)
 
 
 RUNS: dict[str, Callable[[], Steps]] = {"adjust": _adjust_steps, "map": _map_steps, "track": _track_steps}

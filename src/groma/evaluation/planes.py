@@ -187,8 +187,7 @@ def plane_places(scene: Scene) -> FloatArray:
 
     Planes with nothing on them get the foot of the centroid of all points and lines.
     """
-    middles = scene.lines.segments.mean(1)
-    places = np.concatenate([scene.points.xyz, middles])
+    places = np.concatenate([scene.points.xyz, scene.lines.segments.mean(1)])
     on_plane = scene.relations.line_on_plane + np.array([scene.num_points, 0])
     member, plane = np.concatenate([scene.relations.point_on_plane, on_plane]).T
     total = np.zeros((scene.num_planes, 3))

@@ -179,8 +179,7 @@ def spread(
     at = (pixels[order] // cell).astype(np.int64)
     cells = at[:, 1] * columns + at[:, 0]
     order, cells = order[~used[cells]], cells[~used[cells]]
-    first = np.unique(cells, return_index=True)[1]
-    return order[np.sort(first)][:count]
+    return order[np.sort(np.unique(cells, return_index=True)[1])][:count]
 
 
 def corners(image: GrayImage, count: int, distance: float) -> FloatArray:

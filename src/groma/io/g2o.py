@@ -107,8 +107,7 @@ def write_g2o(graph: PoseGraph, path: str | os.PathLike[str], force: bool = Fals
     upper = information[:, *np.triu_indices(size)]
     for name, pose in zip(ids.tolist(), poses.tolist(), strict=True):
         text.write(f"{tags[0]} {name} {_join(pose)}\n")
-    held = ids[graph.poses.held].tolist()
-    text.writelines(f"FIX {name}\n" for name in held)
+    text.writelines(f"FIX {name}\n" for name in ids[graph.poses.held].tolist())
     for first, second, motion, weights in zip(firsts, seconds, motions.tolist(), upper.tolist(), strict=True):
         text.write(f"{tags[1]} {first} {second} {_join(motion)} {_join(weights)}\n")
     content = text.getvalue().encode()

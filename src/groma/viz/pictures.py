@@ -109,8 +109,7 @@ def jpeg_address(picture: Picture, budget: int) -> str:
         if len(address) <= budget:
             break
         # A smaller picture has more detail in each pixel, so the bytes fall slower than the area.
-        scale = max(0.9 * (budget / len(address)) ** 0.55, 0.2)
-        picture = _smaller(picture, scale)
+        picture = _smaller(picture, max(0.9 * (budget / len(address)) ** 0.55, 0.2))
         address = data_address(picture)
     return address
 

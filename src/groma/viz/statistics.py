@@ -51,8 +51,7 @@ def line_statistics(scene: Scene, shown: Drawable | None = None) -> LineStatisti
     shown = shown or drawable(scene)
     seen = scene.line_observations
     ends = shown.residuals[shown.residual_kind == shown.residual_kinds.index("line ends")].reshape(-1, 2, 2)
-    squares = 0.5 * np.einsum("mei,mei->m", ends, ends)
-    far = np.sqrt(squares)
+    far = np.sqrt(0.5 * np.einsum("mei,mei->m", ends, ends))
     return LineStatistics(
         length=supported_lengths(scene),
         num_images=images_of(seen.line_idx, seen.image_idx, scene.num_lines),

@@ -106,8 +106,7 @@ def _adjust(
     numbers = {**result.adjustment.to_dict(), "warnings": list(result.warnings), "ranks": reducer.size}
     numbers |= {"parts": len(paths), "bytes_per_step": getattr(reducer, "bytes_per_sum", 0)}
     numbers["seconds"] |= {"compilation": compilation.seconds, "total": time.perf_counter() - began}
-    sentence = result.report.termination.sentence
-    say_adjustment(console, numbers, sentence, compilation)
+    say_adjustment(console, numbers, result.report.termination.sentence, compilation)
     for kind, rmse in numbers["rmse_px"].items() if not console.verbose else ():
         console.say(f"  rms of all {kind}, outliers included: {rmse['before']:.3f} px -> {rmse['after']:.3f} px")
     console.warn(*result.warnings)

@@ -104,8 +104,7 @@ def match_by_flow(
         if flow.shape != (*one.shape, 2):
             raise ShapeError(f"A flow must have shape {(*one.shape, 2)}, one vector a pixel; got {flow.shape}.")
     there = _votes(segments_1, segments_2, forward, backward, options)
-    back = _votes(segments_2, segments_1, backward, forward, options).T.tocsr()
-    both = there.multiply(back).tocoo()
+    both = there.multiply(_votes(segments_2, segments_1, backward, forward, options).T.tocsr()).tocoo()
     score = np.sqrt(both.data)
     good = score >= options.min_score
     first, second = both.row[good].astype(np.int64), both.col[good].astype(np.int64)

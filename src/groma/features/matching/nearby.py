@@ -29,8 +29,7 @@ class NearbyPoints:
     def common_with(self, other: NearbyPoints) -> NearbyPoints:
         """Without the points that are near no segment of the other image: not seen there, or far from all lines."""
         keep = np.isin(self.point_id, other.point_id)
-        begin = pointers_of(keep)[self.begin]
-        return NearbyPoints(begin, self.point_id[keep], self.distance[keep])
+        return NearbyPoints(pointers_of(keep)[self.begin], self.point_id[keep], self.distance[keep])
 
 
 @loop
@@ -76,8 +75,7 @@ def nearby_points(segments: Segments, points: FloatArray, point_ids: IntArray, r
     if points.ndim != 2 or points.shape[1] != 2 or point_ids.shape != (len(points),):
         raise ShapeError(f"points must have shape (P, 2) and point_ids (P,); got {points.shape} and {point_ids.shape}.")
     order = np.argsort(point_ids, kind="stable")
-    finite = np.isfinite(points[order]).all(axis=1)
-    order = order[finite]
+    order = order[np.isfinite(points[order]).all(axis=1)]
     points, point_ids = points[order], point_ids[order]
     begin = np.zeros(len(segments) + 1, dtype=np.int64)
     column, distance = np.zeros(0, dtype=np.int64), np.zeros(0)

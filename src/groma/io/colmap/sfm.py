@@ -181,8 +181,7 @@ def reconstruct_points(
             "Take more images with more overlap, from places some steps apart, or pass a model with --model."
         )
     # Of equally many images the one with more points, so that the choice does not depend on an order.
-    best = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    return from_pycolmap(best)
+    return from_pycolmap(max(models, key=lambda model: (model.num_reg_images(), model.num_points3D())))
 
 
 def _most_linked(pycolmap: Any, content: Any) -> int:

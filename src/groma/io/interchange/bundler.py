@@ -99,8 +99,7 @@ def _names(path: Path, count: int) -> tuple[Path, list[str]]:
     beside = [path.with_name("list.txt"), path.with_suffix(".list.txt"), path.with_suffix(".txt")]
     above = path.absolute().parent.parent
     prepared = above / "prepare" / "list.txt"  # of RunBundler.sh; its names begin one folder up, too
-    candidates = [*beside, above / "list.txt", prepared]
-    found = next((place for place in candidates if place.is_file()), None)
+    found = next((place for place in [*beside, above / "list.txt", prepared] if place.is_file()), None)
     if found is None:
         return path.parent, [f"{row:08d}.jpg" for row in range(count)]
     names = [line.split()[0] for _, line in read_lines(found)]

@@ -207,8 +207,7 @@ def _check(group: Places) -> None:
 
 
 def _east_north_up(groups: Sequence[Places]) -> tuple[list[FloatArray], WorldFrame]:
-    every = np.concatenate([group.coordinates for group in groups])
-    middle = np.nanmedian(every, axis=0)
+    middle = np.nanmedian(np.concatenate([group.coordinates for group in groups]), axis=0)
     origin = (round(float(middle[0]), 6), round(float(middle[1]), 6), float(round(float(middle[2]))))
     frame = WorldFrame(
         f"east, north and up in metres at longitude {origin[0]:.6f}, latitude {origin[1]:.6f}, height {origin[2]:g}",

@@ -113,8 +113,7 @@ class AdjustmentJob:
             self._forget_columns(at)
             self._forget("points", wrong, self.point_pose, self.point_rows)
             left = np.bincount(points.index[~wrong], minlength=len(track_map.points))
-            gone = self.points[left[self.points] < 1]
-            track_map.drop_points(gone)
+            track_map.drop_points(self.points[left[self.points] < 1])
         if len(lines):
             seen_from = poses[self.line_pose]
             ends, good = line_ends(self.camera, seen_from, track_map.lines.plucker[lines.index], lines.ends)

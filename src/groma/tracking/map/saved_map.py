@@ -69,8 +69,7 @@ def map_of_scene(
     track_map = TrackMap()
     _add_landmarks(track_map, scene)
     for image, name in enumerate(scene.images.names):
-        data = FrameFeatures(frames[name], camera, options)
-        _add_keyframe(track_map, scene, image, data)
+        _add_keyframe(track_map, scene, image, FrameFeatures(frames[name], camera, options))
         say(image + 1, scene.num_images)
     _note_views(track_map)
     track_map.reference = len(track_map.keyframes) - 1

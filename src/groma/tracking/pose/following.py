@@ -99,8 +99,7 @@ def follow_frame(
     # Followed are points that agree, and points without a place; lines likewise.
     keep = np.ones(len(tracks), dtype=bool)
     keep[np.flatnonzero(alive)[~estimate.points]] = False
-    wrong = lines.index[~estimate.lines]
-    segments = segments.take(~np.isin(segments.index, wrong))
+    segments = segments.take(~np.isin(segments.index, lines.index[~estimate.lines]))
     return estimate, Followed(tracks.take(keep), segments)
 
 
@@ -168,8 +167,7 @@ def follow_lines(
     guess, good = _inside(guess, data.gray.shape, gates.min_length)
     rows = np.flatnonzero(agree & good)
     found, of = measured_edges(data.smooth, guess[rows], segments.strength[rows], gates)
-    kept = rows[of]
-    return FollowedSegments(segments.index[kept], found.ends, found.sigma, found.strength)
+    return FollowedSegments(segments.index[rows[of]], found.ends, found.sigma, found.strength)
 
 
 def _inside(ends: FloatArray, shape: tuple[int, int], min_length: float) -> tuple[FloatArray, np.ndarray]:

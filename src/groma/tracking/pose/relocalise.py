@@ -358,8 +358,7 @@ def promote(track_map: TrackMap, found: Found, data: FrameFeatures) -> PointTrac
             index[fresh], usable[fresh] = new, True
         rows = np.flatnonzero(usable)
         tracks = tracks.joined(PointTracks(index[rows], features.pixel[here[rows]]))
-    first = np.unique(tracks.index, return_index=True)[1]
-    return tracks.take(first)
+    return tracks.take(np.unique(tracks.index, return_index=True)[1])
 
 
 def match_lines(

@@ -142,8 +142,7 @@ def _covariances(found: LandmarkCovariances, kept: Kept, offset: FloatArray) -> 
 
 def _triangles(matrices: FloatArray) -> str:
     """Return the upper triangles of symmetric matrices; rows of -1 for unknown ones."""
-    size = matrices.shape[-1]
-    rows = matrices[:, *np.triu_indices(size)]
+    rows = matrices[:, *np.triu_indices(matrices.shape[-1])]
     return pack(np.where(np.isfinite(rows).all(axis=1, keepdims=True), rows, -1.0))
 
 

@@ -134,8 +134,7 @@ def view_content(scene: Scene) -> ViewContent:
     if len(known):
         point_colours["reprojection error"] = _colours.ramp(errors / max(float(np.percentile(known, 90)), 1e-12))
     point_colours["plain"] = np.tile(np.array([[96, 104, 116]], np.uint8), (len(order), 1))
-    pose = frame.poses(scene.cam_from_world)
-    world_from_cam = quaternion.conjugate(pose[:, :4])
+    world_from_cam = quaternion.conjugate(frame.poses(scene.cam_from_world)[:, :4])
     opening, aspect = openings(scene)
     return ViewContent(
         scene=scene,

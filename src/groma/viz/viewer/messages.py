@@ -33,8 +33,7 @@ def counts(scene: Scene, max_cameras: int) -> str:
         ("directions", scene.num_directions),
     ]
     text = words(parts)
-    thinned = f". {max_cameras} of the cameras are drawn" if scene.num_images > max_cameras else ""
-    return text + thinned
+    return text + (f". {max_cameras} of the cameras are drawn" if scene.num_images > max_cameras else "")
 
 
 def legend(low: str | None, high: str | None, meaning: str, shown: int, count: int) -> str:

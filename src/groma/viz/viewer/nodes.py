@@ -197,8 +197,7 @@ class SceneView:
         self._camera_scale = _view_arrays.camera_scale(content.camera_centers)
         warn_of_names_outside(self.images, content.scene.images.names)
         for image in self._camera_images:
-            name = content.scene.images.names[image]
-            path = image_file(self.images, name)
+            path = image_file(self.images, content.scene.images.names[image])
             picture = read_picture(path, THUMBNAIL) if path is not None else None
             self._pictures.append(picture)
             self.num_pictures += picture is not None
@@ -328,8 +327,7 @@ class SceneView:
         """Move the view to the pose of a photograph, or back."""
         if event.client is None:
             return
-        names = self.look_from.options
-        image = names.index(self.look_from.value) - 1
+        image = self.look_from.options.index(self.look_from.value) - 1
         camera = event.client.camera
         # Photographs would cover the view from there.
         self.shown["cameras"].value = image < 0
