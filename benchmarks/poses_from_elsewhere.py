@@ -29,7 +29,7 @@ from groma.io.colmap.sfm import PointModelOptions
 from groma.mapping.map import map_images
 from groma.mapping.options import MapOptions
 from groma.mapping.posed.given import scene_at_poses
-from groma.mapping.posed.place import place_photographs
+from groma.mapping.posed.register import register_photographs
 from groma.scene import Scene
 
 #: Standard deviations of places (metres) and orientations (degrees), and the share of wrong poses.
@@ -84,7 +84,7 @@ def draw(folder: Path, work: Path, case: tuple[float, float, float], seed: int, 
     with tempfile.TemporaryDirectory() as place:
         write_scene(given, Path(place) / "transforms.json")
         start = scene_at_poses(folder / "images", Path(place) / "transforms.json", PointModelOptions())
-        scene = place_photographs(folder / "images", work, start.scene, PointModelOptions()).scene
+        scene = register_photographs(folder / "images", work, start.scene, PointModelOptions()).scene
         mapped = None
         if with_lines:
             mapped = distances(map_images(folder / "images", Path(place) / "map", scene, MapOptions()).scene, survey)

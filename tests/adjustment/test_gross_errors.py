@@ -58,7 +58,7 @@ def test_what_is_wrong_pulls_no_more(truth, name, row, column, by, kind):
     moved = result.scene.cam_centers_in_world - without.scene.cam_centers_in_world
     assert np.abs(moved).max() < 1e-6
     mine = [one for one in found.measurements if one.is_rejected]
-    assert {one.place for one in mine} == {(name, row)} and {one.kind for one in mine} == {kind}
+    assert {one.table_row for one in mine} == {(name, row)} and {one.kind for one in mine} == {kind}
     assert all(one.weight == 0.0 for one in mine) and found.suspects[0].is_rejected
     assert f"{kind} {mine[0].name}" == found.to_dict()["rejected"][0]
 

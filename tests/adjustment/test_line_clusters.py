@@ -9,7 +9,7 @@ import pytest
 import groma
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
-from groma.adjustment.rescue.clusters import settle_clusters
+from groma.adjustment.rescue.clusters import renew_clusters
 from groma.problem.residuals import squared_norms
 from groma.scene import Distances, Relations, synthetic
 from groma.scene.survey import Kind
@@ -52,7 +52,7 @@ def _sine(line, other):
 def test_a_line_and_its_points_come_back_and_nothing_else_moves(scenes):
     truth, wrong, points = scenes
     problem = _problem(wrong)
-    better, moved = settle_clusters(wrong, problem)
+    better, moved = renew_clusters(wrong, problem)
     assert moved.tolist() == [BAD]
     assert _sine(better.variables["lines"].ambient()[BAD], truth.lines.plucker[BAD]) < 0.03
     apart = better.variables["points"].ambient()[points, :3] - truth.points.xyz[points]
@@ -66,13 +66,13 @@ def test_a_line_and_its_points_come_back_and_nothing_else_moves(scenes):
 def test_nothing_moves_at_the_truth_or_where_nothing_is_tied_or_free(scenes):
     truth, wrong, _ = scenes
     problem = _problem(truth)
-    assert settle_clusters(truth, problem)[0] is problem
+    assert renew_clusters(truth, problem)[0] is problem
     loose = _problem(wrong.replace(relations=Relations()))
-    assert settle_clusters(wrong, loose)[0] is loose
+    assert renew_clusters(wrong, loose)[0] is loose
     problem = _problem(wrong)
     held = {**problem.variables, "points": replace(problem.variables["points"], constant=True)}
     problem = type(problem)(held, problem.factors)
-    assert settle_clusters(wrong, problem)[0] is problem
+    assert renew_clusters(wrong, problem)[0] is problem
 
 
 def test_a_point_on_two_lines_makes_them_one_cluster(scenes):
@@ -80,7 +80,7 @@ def test_a_point_on_two_lines_makes_them_one_cluster(scenes):
     shared = np.array([[points[0], BAD + 1]])
     relations = Relations(point_on_line=np.concatenate([truth.relations.point_on_line, shared]))
     problem = _problem(wrong.replace(relations=relations))
-    better = settle_clusters(wrong, problem)[0]
+    better = renew_clusters(wrong, problem)[0]
     unmoved = (better.variables["lines"].state == problem.variables["lines"].state).all(axis=1)
     assert np.flatnonzero(~unmoved).tolist() == [BAD, BAD + 1]
     assert _cost(better) < _cost(problem)
@@ -96,7 +96,7 @@ def test_what_ties_a_cluster_to_lines_outside_of_it_stays_out(scenes):
     widths = Distances(kinds, np.array(others), kinds, np.full(2, BAD), places, lengths, np.full(2, 0.01))
     problem = _problem(wrong.replace(distances=widths))
     assert any(factor.type_name == "distance" for factor in problem.factors)
-    better, moved = settle_clusters(wrong, problem)
+    better, moved = renew_clusters(wrong, problem)
     assert moved.tolist() == [BAD]
     unmoved = (better.variables["lines"].state == problem.variables["lines"].state).all(axis=1)
     assert np.flatnonzero(~unmoved).tolist() == [BAD]

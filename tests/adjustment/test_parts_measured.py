@@ -7,7 +7,7 @@ from _survey_objects import with_control
 from groma.adjustment.assemble import assemble, disassemble
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.parts import adjust_parts, join_parts, write_parts
-from groma.adjustment.survey.place import settled
+from groma.adjustment.survey.best_fit import best_fitted
 from groma.adjustment.terms.camera_poses import held_scale
 from groma.adjustment.terms.principal_points import near_the_middle
 from groma.errors import InputError
@@ -31,11 +31,11 @@ def both(scene, folder, **options):
     paths = write_parts(scene, folder / "parts", SIZE)
     assert len(paths) > 3
     result = adjust_parts(paths, folder / "out", options=GAUSS_NEWTON, **options)
-    whole = settled(join_parts(paths))
+    whole = best_fitted(join_parts(paths))
     how = AssemblyOptions(max_coupled_lines=0, **options)  # points are tied to lines in pixels, as in parts
     solution = solve(assemble(whole, how).problem, GAUSS_NEWTON)
     assert result.report.final_cost == pytest.approx(solution.report.final_cost, rel=1e-11)
-    return join_parts(result.paths), settled(disassemble(whole, solution.problem))
+    return join_parts(result.paths), best_fitted(disassemble(whole, solution.problem))
 
 
 def compare(found, expected, *tables):
@@ -62,7 +62,7 @@ def test_scenes_are_placed_and_their_scale_is_held(positioned, tmp_path):
     assert held_scale(assemble(positioned, AssemblyOptions()).problem) is not None
     found, expected = both(positioned, tmp_path)
     compare(found, expected)
-    off = settled(found).cam_centers_in_world - found.cam_centers_in_world
+    off = best_fitted(found).cam_centers_in_world - found.cam_centers_in_world
     assert np.abs(off).max() < 1e-5
 
 

@@ -9,7 +9,7 @@ import pytest
 import groma
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
-from groma.adjustment.survey.place import moved, settled
+from groma.adjustment.survey.best_fit import best_fitted, moved
 from groma.adjustment.survey.reliability import reliability
 from groma.adjustment.terms.camera_poses import held_scale
 from groma.adjustment.uncertainty import uncertainty
@@ -73,7 +73,7 @@ def test_distances_tell_the_scale_as_places_do(part, count):
     assert assemble(scene, AssemblyOptions()).num_measurements.get("held scale") == count
     assert assemble(_at_positions(5e3 * part), AssemblyOptions()).num_measurements.get("held scale") == 1
     assert assemble(_at_positions(1e-4), AssemblyOptions()).num_measurements.get("held scale") is None
-    scaled = settled(scene.transformed(groma.scene.Similarity(1.2), measured=False)).cam_centers_in_world
+    scaled = best_fitted(scene.transformed(groma.scene.Similarity(1.2), measured=False)).cam_centers_in_world
     assert np.linalg.norm(scaled[1] - scaled[0]) == pytest.approx(apart, rel=1e-6)
 
 
@@ -92,8 +92,8 @@ def test_a_scene_is_placed_at_its_poses_which_stay():
     away = away.replace(pose_priors=scene.pose_priors)
     rough = _at_positions(50.0).camera_positions
     for one in (away, away.replace(camera_positions=rough)):
-        np.testing.assert_allclose(settled(one).cam_from_world, scene.cam_from_world, atol=1e-5)
-        np.testing.assert_array_equal(settled(one).pose_priors.rig_from_world, scene.pose_priors.rig_from_world)
+        np.testing.assert_allclose(best_fitted(one).cam_from_world, scene.cam_from_world, atol=1e-5)
+        np.testing.assert_array_equal(best_fitted(one).pose_priors.rig_from_world, scene.pose_priors.rig_from_world)
 
 
 @pytest.mark.kernels
@@ -103,7 +103,7 @@ def test_a_scene_is_placed_where_its_rough_poses_fit_best():
     turned = scene.transformed(Similarity(1.0, so3.exp(np.array([[0.0, 0.02, 0.01]]))[0], np.array([0.3, 0.0, 0.1])))
     turned = turned.replace(pose_priors=scene.pose_priors)
     found = groma.adjust(turned, groma.AdjustOptions(loss="none", max_iterations=3)).scene
-    off = settled(found).cam_centers_in_world - found.cam_centers_in_world
+    off = best_fitted(found).cam_centers_in_world - found.cam_centers_in_world
     assert np.abs(off).max() < 1e-5
     np.testing.assert_allclose(found.cam_centers_in_world, truth.cam_centers_in_world, atol=0.02)
     held = groma.adjust(turned, groma.AdjustOptions(loss="none", max_iterations=3, refine_poses=False)).scene

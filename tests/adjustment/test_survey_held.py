@@ -11,8 +11,8 @@ from _survey_objects import LEAST_SQUARES, gravity_file, with_control
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.assemble import first_camera_gauge
 from groma.adjustment.survey.attach import with_survey
+from groma.adjustment.survey.best_fit import best_fitted
 from groma.adjustment.survey.given import Survey
-from groma.adjustment.survey.place import settled
 from groma.adjustment.terms.open_motions import coordinates_to_hold
 from groma.adjustment.uncertainty import position_sigma
 from groma.errors import InputError
@@ -65,7 +65,7 @@ def test_a_scene_settles_where_all_measurements_fit(truth):
     scene = truth.replace(camera_positions=positions(truth, rng, 1e-9))
     scene = with_survey(scene, Survey(directions=gravity_file(truth, rng, 1e-6))).scene
     twist = np.array([0.05, 0.1, -0.02, np.sqrt(1 - 0.0129), 0.3, -0.2, 0.1, 1.1])
-    back = settled(scene.transformed(twist, measured=False))
+    back = best_fitted(scene.transformed(twist, measured=False))
     np.testing.assert_allclose(back.cam_centers_in_world, truth.cam_centers_in_world, atol=1e-6)
     assert np.array_equal(back.camera_positions.xyz, scene.camera_positions.xyz)
 

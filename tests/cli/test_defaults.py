@@ -12,7 +12,7 @@ from groma.evaluation.gates import SCORES
 from groma.localization.localizer import LocalizeOptions
 from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.options import MapOptions
-from groma.mapping.posed.place import place_photographs
+from groma.mapping.posed.register import register_photographs
 from groma.scene import synthetic
 from groma.tracking.options import TrackOptions
 
@@ -40,4 +40,4 @@ def test_commands_have_the_defaults_of_what_they_call(command, argument, there):
 
 
 def test_photographs_are_placed_with_the_steps_of_a_map():
-    assert _default(place_photographs, "max_iterations") == MapOptions().max_iterations
+    assert _default(register_photographs, "max_iterations") == MapOptions().max_iterations

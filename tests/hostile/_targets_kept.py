@@ -26,10 +26,10 @@ from groma.features.depth.noise import DepthNoise
 from groma.io import read_scene, write_archive
 from groma.localization.map_images import images_in_summary
 from groma.localization.map_index import MapIndex, images_told, read_index
-from groma.localization.placed import PlacedImage, read_placed, unreadable
-from groma.mapping.checkpoint_files import ADJUSTED, ARRAY, DEPTHS, LINE_MAP, PLACED, SEGMENTS
+from groma.localization.stored import StoredImage, read_stored, unreadable
+from groma.mapping.checkpoint_files import ADJUSTED, ARRAY, DEPTHS, LINE_MAP, REGISTERED, SEGMENTS
 from groma.mapping.depth.points import MeasuredDepths
-from groma.mapping.posed.placed import PlacedPhotographs
+from groma.mapping.posed.registered import RegisteredPhotographs
 from groma.scene import Cameras, Points, Scene, synthetic
 from groma.solver.reduce.journal import Waypoint
 from groma.solver.reduce.single import SingleProcess
@@ -76,7 +76,7 @@ def _stages(work: Path) -> Iterator[Made]:
     yield "kept_line_map", {"l.npz": npz(**line_map)}, one(LINE_MAP.read, "l.npz")
     results = {
         "adjusted": (ADJUSTED, adjust(SMALL, AdjustOptions(max_iterations=2))),
-        "placed": (PLACED, PlacedPhotographs(SMALL.points_only(), ("a note",), ("a warning",))),
+        "registered": (REGISTERED, RegisteredPhotographs(SMALL.points_only(), ("a note",), ("a warning",))),
         "depths": (
             DEPTHS, MeasuredDepths(SMALL.points_only(), np.ones(4), DepthNoise(), 1.5, False, (0.2, 0.1), ("told",)),
         ),
@@ -133,7 +133,7 @@ def _maps(work: Path) -> Iterator[Made]:
         covariance=np.eye(6), model="PINHOLE", params=np.array([9.0, 9.0, 5.0, 5.0]), size=np.array([10, 10]),
     )  # fmt: skip
     found.write(work / "p.npz", "digest")
-    yield "placed_image", _files(work), _placed
+    yield "stored_image", _files(work), _stored
     write_covariances(work / "c.npz", SMALL, groma.uncertainty(SMALL))
     yield "covariances", _files(work), functools.partial(_covariances, SMALL)
     yield "summary_images", {"summary.json": json.dumps({"images": "/nowhere"}).encode()}, images_in_summary
@@ -143,8 +143,8 @@ def _index(folder: Path) -> object:
     return read_index(folder / "i.npz", "digest"), images_told(folder / "i.npz")
 
 
-def _placed(folder: Path) -> object:
-    found: PlacedImage | None = read_placed(folder / "p.npz", "digest")
+def _stored(folder: Path) -> object:
+    found: StoredImage | None = read_stored(folder / "p.npz", "digest")
     return None if found is None else (found.to_dict(), found.camera)
 
 

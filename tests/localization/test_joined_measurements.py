@@ -10,8 +10,8 @@ from worlds import CAMERA
 from groma.adjustment.terms.principal_points import near_the_middle
 from groma.geometry import quaternion, so3
 from groma.localization.joining.measurements import with_measurements_of
-from groma.localization.placed import PlacedImage
 from groma.localization.registered import with_queries
+from groma.localization.stored import StoredImage
 from groma.scene import (
     CameraPositions,
     Cameras,
@@ -202,7 +202,7 @@ def test_depths_of_a_map_stay_with_its_segments_beside_those_of_queries(joint):
         line_observations=LineObservations([2, 0], [0, 0], segments, [1.0, 1.0]),
         line_depths=LineDepths([0, 1], [[0.1, 0.2], [0.3, 0.4]], np.full((2, 2), 0.01), [0.5, 0.5]),
     )
-    query = PlacedImage(
+    query = StoredImage(
         "new.jpg", "localized", "", np.array([0.0, 0, 0, 1, 0, 0, 0]), np.eye(6), "PINHOLE",
         np.array([500.0, 500, 320, 240]), np.array([640, 480]), np.array([0]), np.ones((1, 2)), np.array([0]),
         np.ones((1, 4)), 0.0,

@@ -15,7 +15,7 @@ from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pieces import cells_elsewhere
 from groma.localization.pose.refinement import fitted, refine
-from groma.localization.pose.verdict import Shown, evidence_of, place_not_in_map, votes_of_a_rival
+from groma.localization.pose.verdict import Shown, evidence_of, site_not_in_map, votes_of_a_rival
 
 
 def _in_pieces(world, rng, moved):
@@ -149,14 +149,14 @@ def test_another_place_is_the_more_probable_the_more_the_map_repeats_and_the_les
     """Where nothing repeats and nothing tells a pose is believed; half of the cells that repeat are even odds of a
     half, and missing points count where nothing repeats, too.
     """
-    assert place_not_in_map(40, 0, Shown()).odds == pytest.approx(5e-4)
-    assert place_not_in_map(40, 20, Shown()).odds == pytest.approx(0.5, abs=1e-3)
-    assert place_not_in_map(40, 90, Shown()).odds == pytest.approx(1.0, abs=1e-3)
+    assert site_not_in_map(40, 0, Shown()).odds == pytest.approx(5e-4)
+    assert site_not_in_map(40, 20, Shown()).odds == pytest.approx(0.5, abs=1e-3)
+    assert site_not_in_map(40, 90, Shown()).odds == pytest.approx(1.0, abs=1e-3)
     # Where a place repeats, half of what agrees does: 4 of 23 are less than that by chance once in 770.
     few = 4 / 23 * 2.0 * binom.cdf(4, 23, 0.5)
-    assert place_not_in_map(23, 4, Shown()).odds == pytest.approx(few + 5e-4, rel=1e-9)
-    assert place_not_in_map(40, 0, Shown(found=(2, 0), expected=(12.0, 0.0))).odds > 0.01
-    assert place_not_in_map(40, 40, Shown(found=(0, 18), expected=(0.0, 18.0))).odds < 1e-3
+    assert site_not_in_map(23, 4, Shown()).odds == pytest.approx(few + 5e-4, rel=1e-9)
+    assert site_not_in_map(40, 0, Shown(found=(2, 0), expected=(12.0, 0.0))).odds > 0.01
+    assert site_not_in_map(40, 40, Shown(found=(0, 18), expected=(0.0, 18.0))).odds < 1e-3
 
 
 def test_what_is_found_at_a_place_that_is_known_is_no_piece_of_another():

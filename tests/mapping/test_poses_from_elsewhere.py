@@ -23,7 +23,7 @@ from groma.mapping.posed.averaging import average_centers, average_rotations
 from groma.mapping.posed.axes import check_axes
 from groma.mapping.posed.motions import motions_of
 from groma.mapping.posed.noise import noise_of_given
-from groma.mapping.posed.place import averaged
+from groma.mapping.posed.register import averaged
 from groma.scene import Cameras, Scene
 
 FOCAL, COUNT = 800.0, 14

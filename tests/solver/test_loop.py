@@ -180,7 +180,7 @@ def test_ends():
     tiny = Curve(cost=lambda x: 32.0, damping=1e15)
     assert run(tiny, function_tolerance=0.0).termination is Termination.DAMPING_EXHAUSTED
     settled = Curve()
-    settled.try_step = lambda: replace(settled.at(7.0), settled=True)
+    settled.try_step = lambda: replace(settled.at(7.0), all_converged=True)
     assert run(settled).termination is Termination.COST_CONVERGED
 
 

@@ -19,11 +19,11 @@ from groma.adjustment.misfit.calibration import refuse_focal_lengths
 from groma.adjustment.misfit.lens import begin_lens_test
 from groma.adjustment.misfit.rig import rig_that_does_not_fit
 from groma.adjustment.misfit.turning import motion_that_may_be_turning
+from groma.adjustment.moved_problem import problem_at
 from groma.adjustment.outcome import drop_failed_relations, report_of
 from groma.adjustment.pixel_residuals import squared_residuals_px
-from groma.adjustment.places import at_places_of
 from groma.adjustment.report import AdjustReport, AdjustResult, Progress
-from groma.adjustment.rescue.clusters import settle_clusters
+from groma.adjustment.rescue.clusters import renew_clusters
 from groma.adjustment.rescue.restart import renew_lines, with_seen_ends
 from groma.adjustment.rescue.slips import without_slips
 from groma.adjustment.stages import (
@@ -35,7 +35,7 @@ from groma.adjustment.stages import (
     with_costs_at,
     with_loss,
 )
-from groma.adjustment.survey.place import settled
+from groma.adjustment.survey.best_fit import best_fitted
 from groma.adjustment.terms.contract import Term
 from groma.adjustment.terms.objects import with_held_states
 from groma.adjustment.terms.principal_points import near_the_middle_if_guessed
@@ -166,20 +166,20 @@ def adjust(
     scene = near_the_middle_if_guessed(scene, options.refine_intrinsics, options.refine_principal_point)
     with one_blas_thread():
         if (near := local_frame(scene)) is None:
-            return _settled(scene, options, progress)
-        result = _settled(scene.transformed(near), options, progress)
+            return _adjusted_at_best_fit(scene, options, progress)
+        result = _adjusted_at_best_fit(scene.transformed(near), options, progress)
     back = result.scene.transformed(near.inverse())
-    return replace(result, scene=back, problem=result.problem and at_places_of(result.problem, back))
+    return replace(result, scene=back, problem=result.problem and problem_at(result.problem, back))
 
 
-def _settled(scene: Scene, options: AdjustOptions, progress: _Progress) -> AdjustResult:
-    """Adjust a scene that is first and last placed where measured places and poses known beforehand fit best."""
+def _adjusted_at_best_fit(scene: Scene, options: AdjustOptions, progress: _Progress) -> AdjustResult:
+    """Adjust a scene that is first and last moved to where measured places and poses known beforehand fit best."""
     if not options.refine_poses:
         return _adjusted(scene, options, progress)
-    result = _adjusted(settled(scene), options, progress)
-    if (after := settled(result.scene)) is result.scene:
+    result = _adjusted(best_fitted(scene), options, progress)
+    if (after := best_fitted(result.scene)) is result.scene:
         return result
-    return replace(result, scene=after, problem=result.problem and at_places_of(result.problem, after, shifted=False))
+    return replace(result, scene=after, problem=result.problem and problem_at(result.problem, after, shifted=False))
 
 
 def _in_model(scene: Scene, options: AdjustOptions, name: str, progress: _Progress) -> tuple[Scene, AdjustOptions]:
@@ -259,7 +259,7 @@ def _solve_stages(scene: Scene, options: AdjustOptions, assembly: Assembly, prog
             break
         if options.max_iterations and not last:
             solving.take(*renew_lines(scene, solving.problem, options.threads))
-            solving.take(*settle_clusters(scene, solving.problem, options.threads))
+            solving.take(*renew_clusters(scene, solving.problem, options.threads))
         if not isinstance(loss, Trivial) and solution.report.iterations:
             solving.take(*without_slips(solving.problem, options.threads))
             if last and solving.problem is not solution.problem:

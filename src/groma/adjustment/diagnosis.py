@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
-from groma.adjustment.places import at_places_of
+from groma.adjustment.moved_problem import problem_at
 from groma.adjustment.terms.open_motions import num_open_motions
 from groma.problem.problem import Problem
 from groma.scene import Scene
@@ -44,7 +44,7 @@ def diagnose_scene(
     near = local_frame(scene)
     if near is not None:
         scene = scene.transformed(near)
-        problem = None if problem is None else at_places_of(problem, scene)
+        problem = None if problem is None else problem_at(problem, scene)
     if problem is None:
         unknown = AssemblyOptions(refine_intrinsics=None, refine_principal_point=None)
         problem = assemble(scene, options or unknown).problem

@@ -12,7 +12,7 @@ import numpy as np
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import assemble, first_camera_gauge
 from groma.adjustment.assembly_options import AssemblyOptions
-from groma.adjustment.places import at_places_of
+from groma.adjustment.moved_problem import problem_at
 from groma.adjustment.terms.camera_poses import held_scale
 from groma.adjustment.terms.objects import with_held
 from groma.adjustment.terms.principal_points import with_principal_points_known_to
@@ -124,7 +124,7 @@ def uncertainty(
     if near is None:
         return _uncertainty(scene, options, gauge, sigma0, problem)
     moved = scene.transformed(near)
-    found = _uncertainty(moved, options, gauge, sigma0, None if problem is None else at_places_of(problem, moved))
+    found = _uncertainty(moved, options, gauge, sigma0, None if problem is None else problem_at(problem, moved))
     lines, planes = np.eye(6), np.eye(4)
     lines[:3, 3:], planes[3, :3] = so3.hat(-near.translation), near.translation
     return replace(found, lines=lines @ found.lines @ lines.T, planes=planes @ found.planes @ planes.T)
@@ -188,7 +188,7 @@ def pose_uncertainty(
     near = local_frame(scene)
     if near is not None:
         scene = scene.transformed(near)
-        problem = at_places_of(problem, scene)
+        problem = problem_at(problem, scene)
     try:
         gauge, covariances = _covariances(scene, AssemblyOptions(), gauge, problem, 1.0 if by_landmarks else sigma0)
         poses = covariances.of_coordinates("frames") * (1.0 if by_landmarks else sigma0**2)

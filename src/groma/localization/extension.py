@@ -17,9 +17,9 @@ from groma.evaluation.alignment import align_poses
 from groma.localization.calibration import CalibrationChoice
 from groma.localization.localizer import Localizer
 from groma.localization.map_index import Progress
-from groma.localization.placed import PlacedImage
 from groma.localization.posed_model import gather_photographs, with_photographs
 from groma.localization.run import localize_images
+from groma.localization.stored import StoredImage
 from groma.mapping.photographs import content_digest
 from groma.mapping.result import MapResult
 from groma.scene import Scene, Similarity
@@ -37,7 +37,7 @@ class ExtendedModel:
     #: The map before.
     map: Scene
     #: What became of the new ones.
-    queries: tuple[PlacedImage, ...]
+    queries: tuple[StoredImage, ...]
     #: Photographs that the map has already.
     num_known: int = 0
 
@@ -84,7 +84,7 @@ def extended_model(
     num_given, files = len(files), _without_known(files, localizer.files)
     if not files:
         raise InputError(f"The map has all of the {counted(num_given, 'photographs')} already. Pass new ones.")
-    before, done = localizer.scene, dict[str, PlacedImage]()
+    before, done = localizer.scene, dict[str, StoredImage]()
     waiting, scene = dict(files), localizer.scene
     for turn in range(len(files)):
         found = localize_images(localizer, waiting, work / str(turn), choice, say)

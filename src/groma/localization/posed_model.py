@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Photographs that were placed in a map, with the map as a model to map from: points tie all of them together."""
+"""Photographs that were localised in a map, with the map as a model to map from: points tie all of them together."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from groma.errors import InputError
 from groma.execution import map_work
 from groma.localization.features import DescribedPoints, find_corners, find_points
 from groma.localization.map_index import MapIndex, Progress
-from groma.localization.placed import PlacedImage
 from groma.localization.registered import with_queries
 from groma.localization.retrieval import VladRetrieval
+from groma.localization.stored import StoredImage
 from groma.localization.triangulation import triangulate_features
 from groma.mapping.photographs import read_gray
 from groma.scene import Keypoints, PointObservations, Points, Scene
@@ -34,7 +34,7 @@ _SAME_PLACE = 1.0
 
 
 def with_photographs(
-    scene: Scene, index: MapIndex, placed: Sequence[PlacedImage], files: Sequence[Path], say: Progress
+    scene: Scene, index: MapIndex, queries: Sequence[StoredImage], files: Sequence[Path], say: Progress
 ) -> Scene:
     """Return a map with more photographs, and points that tie them to it and to each other.
 
@@ -45,7 +45,7 @@ def with_photographs(
     ----------
     scene, index
         The map.
-    placed
+    queries
         The new photographs.
     files
         Of all photographs, those of the map first.
@@ -57,7 +57,7 @@ def with_photographs(
     InputError
         If an image cannot be read, or no point is seen by a new photograph.
     """
-    both = with_queries(scene, index, [_without_landmarks(one) for one in placed])
+    both = with_queries(scene, index, [_without_landmarks(one) for one in queries])
     features = map_work(_find, list(files), partial(say, "finding points in images"))
     made = triangulate_features(both, features, _pairs(features), partial(say, "placing points"))
     image = np.repeat(np.arange(len(features)), [len(one) for one in features])
@@ -82,7 +82,7 @@ def with_photographs(
     return both.replace(points=joined(both.points, points), point_observations=seen, keypoints=Keypoints())
 
 
-def _without_landmarks(one: PlacedImage) -> PlacedImage:
+def _without_landmarks(one: StoredImage) -> StoredImage:
     none = np.zeros(0, np.int64)
     return replace(one, point=none, pixel=np.zeros((0, 2)), line=none, segment=np.zeros((0, 4)))
 

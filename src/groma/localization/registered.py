@@ -10,13 +10,13 @@ import numpy as np
 from groma._typing import IntArray
 from groma.errors import InputError
 from groma.localization.map_index import MapIndex
-from groma.localization.placed import PlacedImage
+from groma.localization.stored import StoredImage
 from groma.scene import Cameras, Frames, Images, LineObservations, PointObservations, Points, Rigs, Scene, Sensors
 from groma.scene.camera import CAMERA
 from groma.scene.table import Table, joined, references
 
 
-def with_queries(scene: Scene, index: MapIndex, queries: Sequence[PlacedImage]) -> Scene:
+def with_queries(scene: Scene, index: MapIndex, queries: Sequence[StoredImage]) -> Scene:
     """Return a map with queries as images after its own, and the points that they see.
 
     A query with the calibration of the map's one camera of its size was taken with that; others have new cameras.
@@ -45,7 +45,7 @@ def with_queries(scene: Scene, index: MapIndex, queries: Sequence[PlacedImage]) 
     return scene.replace(**(referring | tables))
 
 
-def _images(scene: Scene, queries: Sequence[PlacedImage]) -> dict[str, Table]:
+def _images(scene: Scene, queries: Sequence[StoredImage]) -> dict[str, Table]:
     """Frames and images of queries, and the cameras that the map lacks, each alone on a rig."""
     place = _own_cameras(scene)
     fresh = {_camera_key(one): one for one in queries if _camera_key(one) not in place}
@@ -85,7 +85,7 @@ def _own_cameras(scene: Scene) -> dict[tuple[object, ...], tuple[int, ...]]:
     return out
 
 
-def _names(scene: Scene, queries: Sequence[PlacedImage]) -> tuple[str, ...]:
+def _names(scene: Scene, queries: Sequence[StoredImage]) -> tuple[str, ...]:
     """Names of queries; those that an image of the map has, too, are put into a folder ``query``."""
     taken = set(scene.images.names)
     names = tuple(f"query/{one.name}" if one.name in taken else one.name for one in queries)
@@ -94,7 +94,7 @@ def _names(scene: Scene, queries: Sequence[PlacedImage]) -> tuple[str, ...]:
     return names
 
 
-def _seen(queries: Sequence[PlacedImage], number: IntArray, row: IntArray) -> dict[str, Table]:
+def _seen(queries: Sequence[StoredImage], number: IntArray, row: IntArray) -> dict[str, Table]:
     """What queries see: ``number`` are their images, ``row`` the points of the scene, of rows of the index."""
     of_points = np.repeat(number, [len(one.point) for one in queries])
     of_lines = np.repeat(number, [len(one.line) for one in queries])
@@ -106,5 +106,5 @@ def _seen(queries: Sequence[PlacedImage], number: IntArray, row: IntArray) -> di
     }
 
 
-def _camera_key(one: PlacedImage) -> tuple[object, ...]:
+def _camera_key(one: StoredImage) -> tuple[object, ...]:
     return (one.model, *one.params.tolist(), *one.size.tolist())

@@ -15,8 +15,8 @@ from groma._counted import counted
 from groma.bounded.json_text import json_text
 from groma.io import atomic_output, write_scene
 from groma.localization.map_index import MapIndex
-from groma.localization.placed import PlacedImage
 from groma.localization.registered import with_queries
+from groma.localization.stored import StoredImage
 from groma.scene import Scene
 from groma.viz.report.page import PageContents, write_report
 
@@ -29,7 +29,7 @@ class LocalizeResult:
     map: Scene
     index: MapIndex
     #: All queries, found or not.
-    queries: tuple[PlacedImage, ...]
+    queries: tuple[StoredImage, ...]
 
     def count(self, status: str) -> int:
         """Number of queries with a status."""
@@ -95,7 +95,7 @@ class LocalizeResult:
         return name if name in known else name.removeprefix("query/")
 
 
-def _table(queries: Sequence[PlacedImage]) -> str:
+def _table(queries: Sequence[StoredImage]) -> str:
     """The queries as a card of the page."""
     rows = "".join(
         f'<tr><td class="name">{html.escape(one.name)}</td><td>{one.status}</td>'

@@ -16,7 +16,7 @@ from groma.execution import map_work
 from groma.localization.calibration import CalibrationChoice, calibration_of
 from groma.localization.localizer import Localizer
 from groma.localization.map_index import digest_of
-from groma.localization.placed import PlacedImage, placed, read_placed, unreadable
+from groma.localization.stored import StoredImage, read_stored, stored, unreadable
 from groma.mapping.folder_lock import lock_folder
 from groma.mapping.photographs import image_files, read_gray
 from groma.solver.linear.blas import one_blas_thread
@@ -49,7 +49,7 @@ def localize_images(
     work: Path,
     choice: CalibrationChoice | None = None,
     progress: Callable[[str, int, int], None] | None = None,
-) -> list[PlacedImage]:
+) -> list[StoredImage]:
     """Localise photographs.
 
     Parameters
@@ -74,12 +74,12 @@ def localize_images(
 
 def _kept(
     localizer: Localizer, choice: CalibrationChoice, work: Path, told: str, query: tuple[str, Path]
-) -> PlacedImage:
+) -> StoredImage:
     """Localise a photograph, unless that is done already, and keep the result."""
     name, path = query
     file = work / f"{hashlib.sha256(name.encode()).hexdigest()[:16]}.npz"
     digest = hashlib.sha256(f"{told} {_state_of(path)}".encode()).hexdigest()
-    one = read_placed(file, digest)
+    one = read_stored(file, digest)
     if one is None:
         one = _localize(localizer, name, path, choice)
         one.write(file, digest)
@@ -87,14 +87,14 @@ def _kept(
     return one
 
 
-def _localize(localizer: Localizer, name: str, path: Path, choice: CalibrationChoice) -> PlacedImage:
+def _localize(localizer: Localizer, name: str, path: Path, choice: CalibrationChoice) -> StoredImage:
     try:
         image = read_gray(path)
         size = image.shape[1], image.shape[0]
         calibration = calibration_of(
             path, size, localizer.camera_of_map(*size), choice, localizer.photograph_of_map(*size)
         )
-        return placed(name, localizer.localize(image, calibration.camera, calibration.refine))
+        return stored(name, localizer.localize(image, calibration.camera, calibration.refine))
     except GromaError as error:
         return unreadable(name, str(error))
 

@@ -19,7 +19,7 @@ from groma.io import atomic_output, read_archive, write_archive
 from groma.io.reading import reading
 from groma.mapping.depth.points import MeasuredDepths
 from groma.mapping.lines.line_map import LineMap
-from groma.mapping.posed.placed import PlacedPhotographs
+from groma.mapping.posed.registered import RegisteredPhotographs
 from groma.solver.report import Iteration, SolveReport
 from groma.solver.termination import Termination
 
@@ -118,18 +118,20 @@ def _read_adjusted(path: Path) -> AdjustResult:
     return AdjustResult(read_archive(path), _read_report(path.with_suffix(".report.npz")))
 
 
-def _write_placed(placed: PlacedPhotographs, path: Path) -> None:
+def _write_registered(registered: RegisteredPhotographs, path: Path) -> None:
     # The scene comes last: where it is, the words are.
-    _write_arrays(path.with_suffix(".words.npz"), {"words": np.array(json.dumps([placed.notes, placed.warnings]))})
-    write_archive(placed.scene, path)
+    _write_arrays(
+        path.with_suffix(".words.npz"), {"words": np.array(json.dumps([registered.notes, registered.warnings]))}
+    )
+    write_archive(registered.scene, path)
 
 
-def _read_placed(path: Path) -> PlacedPhotographs:
+def _read_registered(path: Path) -> RegisteredPhotographs:
     words = path.with_suffix(".words.npz")
     saved = _read_arrays(words)
     with reading(words, "finished stage"):
         notes, warnings = json.loads(str(saved["words"]))
-        return PlacedPhotographs(read_archive(path), tuple(notes), tuple(warnings))
+        return RegisteredPhotographs(read_archive(path), tuple(notes), tuple(warnings))
 
 
 def _write_depths(measured: MeasuredDepths, path: Path) -> None:
@@ -160,6 +162,6 @@ SCENE = FileKind(write_archive, read_archive)
 SEGMENTS = FileKind(_write_segments, _read_segments)
 LINE_MAP = FileKind(_write_line_map, _read_line_map)
 ADJUSTED = FileKind(_write_adjusted, _read_adjusted)
-PLACED = FileKind(_write_placed, _read_placed)
+REGISTERED = FileKind(_write_registered, _read_registered)
 DEPTHS = FileKind(_write_depths, _read_depths)
 ARRAY = FileKind(_write_array, _read_array)

@@ -139,7 +139,7 @@ class Stages(Generic[_Options]):
             self._lock.close()
             self._lock = None
 
-    def place(self, name: str) -> Path:
+    def folder_of(self, name: str) -> Path:
         """Return a folder of the current stage for its intermediate files."""
         folder = self.folder / f"{name}-{self._key[:_KEY_LENGTH]}"
         self._drop_others(name, folder)
@@ -159,7 +159,7 @@ class Stages(Generic[_Options]):
         tag : str
             Ends the name, of a stage that is done more than once.
         """
-        return self._kept(stage, self._place_of(stage, given, tag), values, self.say)
+        return self._kept(stage, self._file_of(stage, given, tag), values, self.say)
 
     def run_beside(
         self, words: str, aside: tuple[Stage[_Options, Any], Any], stage: Stage[_Options, _Result], *values: Any,
@@ -170,11 +170,11 @@ class Stages(Generic[_Options]):
         The first, which is given with its value, is done in a thread of this process where there are several, and is
         said with some words when it begins; where there is one, it is done before the other.
         """
-        places = self._place_of(aside[0], None, ""), self._place_of(stage, given, "")
+        files = self._file_of(aside[0], None, ""), self._file_of(stage, given, "")
         if num_threads() < 2:
-            first = self._kept(aside[0], places[0], aside[1:], self.say)
-            return first, self._kept(stage, places[1], values, self.say)
-        if not places[0].exists():
+            first = self._kept(aside[0], files[0], aside[1:], self.say)
+            return first, self._kept(stage, files[1], values, self.say)
+        if not files[0].exists():
             self.say(words, 0, 1)
         found: list[Any] = []
         is_left = threading.Event()
@@ -184,17 +184,17 @@ class Stages(Generic[_Options]):
                 raise KeyboardInterrupt
 
         def do_aside() -> None:
-            found.append(self._kept(aside[0], places[0], aside[1:], go_on))
+            found.append(self._kept(aside[0], files[0], aside[1:], go_on))
 
         with beside(do_aside):
             try:
-                result = self._kept(stage, places[1], values, self.say)
+                result = self._kept(stage, files[1], values, self.say)
             except BaseException:
                 is_left.set()
                 raise
         return found[0], result
 
-    def _place_of(self, stage: Stage[_Options, Any], given: object, tag: str) -> Path:
+    def _file_of(self, stage: Stage[_Options, Any], given: object, tag: str) -> Path:
         """Return the file of the next stage."""
         name = stage.name + tag
         self._key = digest(self._key, name, stage.depends(self.options), given)

@@ -4,8 +4,8 @@
 Stages, each saved when it is finished, so that an interrupted run goes on where it was:
 
 1. ``model``      points and poses: read, reconstructed from the images, or found at poses without points
-                  (``placed``); adjusted with robust losses (``points``);
-                  the points' observations placed anew by their grey levels, and adjusted again (``measured``);
+                  (``registered``); adjusted with robust losses (``points``);
+                  the points' observations found anew by their grey levels, and adjusted again (``measured``);
                   with depth maps brought to their unit, and adjusted with depths (``depths``);
 2. ``segments``   line segments in every image, one image at a time;
 3. ``lines``      3D lines from the segments;

@@ -105,7 +105,7 @@ def refine_points(
 
     for k, points in enumerate(chunks):
         templates = search.templates(points, step(2 * k))
-        for rows, found in search.places(points, templates, step(2 * k + 1)):
+        for rows, found in search.positions(points, templates, step(2 * k + 1)):
             spread = np.sqrt(0.5 * np.trace(found.covariance, axis1=1, axis2=2) + EDGES.min_sigma**2)
             good = found.found & (found.correlation >= GATES.min_correlation) & (spread < sigma_px)
             good &= norm(found.pixels - table.pixel[rows]) <= GATES.max_shift
@@ -152,7 +152,7 @@ class _Search:
                 found.levels[points_here], found.fractions[points_here] = cut.levels, cut.fractions
         return found
 
-    def places(
+    def positions(
         self, points: range, templates: Templates, progress: Callable[[int, int], None]
     ) -> list[tuple[IntArray, Alignment]]:
         """Rows of the other observations of these points in each image, and where their templates are found."""
@@ -168,7 +168,7 @@ class _Search:
             here = order[starts[i] : starts[i + 1]]
             rows.append(searched[here])
             work.append((i, point[rows[-1]] - points.start, table.pixel[rows[-1]], shapes[here]))
-        found = map_work(partial(_places_in, self.read, templates), work, progress)
+        found = map_work(partial(_positions_in, self.read, templates), work, progress)
         return [(rows[i], one) for i, one in enumerate(found) if one is not None]
 
 
@@ -177,7 +177,7 @@ def _templates_in(read: Callable[[int], GrayImage], image: tuple[int, FloatArray
     return cut_templates(smoothed(read(image[0])), image[1]) if len(image[1]) else None
 
 
-def _places_in(
+def _positions_in(
     read: Callable[[int], GrayImage], templates: Templates, image: tuple[int, IntArray, FloatArray, FloatArray]
 ) -> Alignment | None:
     """Where some templates are found in an image, from their pixels and shapes there; None for no template."""

@@ -15,11 +15,11 @@ from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.misfit.lens import unmodelled_distortion
 from groma.adjustment.terms.principal_points import near_the_middle
 from groma.io.colmap.sfm import reconstruct_points
-from groma.mapping.checkpoint_files import PLACED, SCENE
+from groma.mapping.checkpoint_files import REGISTERED, SCENE
 from groma.mapping.checkpoints import Stages, stage
 from groma.mapping.options import MapOptions, StageProgress
-from groma.mapping.posed.place import place_photographs
-from groma.mapping.posed.placed import PlacedPhotographs
+from groma.mapping.posed.register import register_photographs
+from groma.mapping.posed.registered import RegisteredPhotographs
 from groma.mapping.shown import check_points_shown
 from groma.scene import Scene
 
@@ -28,7 +28,7 @@ SIMPLE_LENS, WIDER_LENS = "SIMPLE_RADIAL", "RADIAL"
 LENS_NOTE = f"The lens needs two coefficients of distortion ({WIDER_LENS}): one left more in the residuals than noise."
 
 
-def start_of(folder: Path, names: list[str], model: Scene | None, stages: Stages[MapOptions]) -> PlacedPhotographs:
+def start_of(folder: Path, names: list[str], model: Scene | None, stages: Stages[MapOptions]) -> RegisteredPhotographs:
     """Return poses and points of photographs, from the given data.
 
     Parameters
@@ -43,10 +43,10 @@ def start_of(folder: Path, names: list[str], model: Scene | None, stages: Stages
         Keeps the result.
     """
     if model is not None and not model.num_point_observations:
-        return stages.run(place_at_poses, folder, model, stages.place)
-    scene = stages.run(find_start, folder, names, model, stages.place)
+        return stages.run(register_at_poses, folder, model, stages.folder_of)
+    scene = stages.run(find_start, folder, names, model, stages.folder_of)
     widened = model is None and _is_unknown(stages.options) and WIDER_LENS in scene.cameras.models
-    return PlacedPhotographs(scene, (LENS_NOTE,) if widened else ())
+    return RegisteredPhotographs(scene, (LENS_NOTE,) if widened else ())
 
 
 @stage("model", SCENE, lambda o: (o.point_model(threads=False), o.refine_intrinsics, o.max_iterations))
@@ -54,7 +54,7 @@ def find_start(
     folder: Path,
     names: list[str],
     model: Scene | None,
-    place: Callable[[str], Path],
+    folder_of: Callable[[str], Path],
     options: MapOptions,
     say: StageProgress,
 ) -> Scene:
@@ -62,7 +62,7 @@ def find_start(
     if model is not None:
         check_points_shown(model, [folder / name for name in model.images.names])
         return model
-    found = reconstruct_points(folder, place("sfm"), names, options.point_model(), say)
+    found = reconstruct_points(folder, folder_of("sfm"), names, options.point_model(), say)
     if options.point_model().is_partly_calibrated:
         return found
     if options.refine_intrinsics is not False:
@@ -99,11 +99,13 @@ def _is_unknown(options: MapOptions) -> bool:
 
 
 @stage(
-    "placed", PLACED, lambda o: (o.point_model(threads=False), o.refine_poses, o.refine_intrinsics, o.max_iterations)
+    "registered",
+    REGISTERED,
+    lambda o: (o.point_model(threads=False), o.refine_poses, o.refine_intrinsics, o.max_iterations),
 )
-def place_at_poses(
-    folder: Path, given: Scene, place: Callable[[str], Path], options: MapOptions, say: StageProgress
-) -> PlacedPhotographs:
+def register_at_poses(
+    folder: Path, given: Scene, folder_of: Callable[[str], Path], options: MapOptions, say: StageProgress
+) -> RegisteredPhotographs:
     """Points at given poses, and what these are worth."""
     how = (options.refine_poses, bool(options.refine_intrinsics), options.max_iterations)
-    return place_photographs(folder, place("sfm"), given, options.point_model(), *how, say)
+    return register_photographs(folder, folder_of("sfm"), given, options.point_model(), *how, say)

@@ -33,7 +33,7 @@ class Trial:
     #: What the damping holds back of the decrease, to first order.
     withheld: float = 0.0
     #: Whether all variables have converged, where each is judged on its own; None where the cost decides.
-    settled: bool | None = None
+    all_converged: bool | None = None
 
     def without_step(self) -> Self:
         """Return what stands for a step that could not be found, because the linear system was singular."""

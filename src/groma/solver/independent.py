@@ -308,7 +308,7 @@ class IndependentProblem:
     def try_step(self) -> IndependentTrial:  # noqa: D102
         with self._watch("linearize"):
             states, costs, came = self._blocks.advance(self.states, self._here.costs)
-        found = {"cost": _total(costs) + self._outside, "length": came.length, "settled": came.unfinished == 0}
+        found = {"cost": _total(costs) + self._outside, "length": came.length, "all_converged": came.unfinished == 0}
         return IndependentTrial(**found, states=states, costs=costs)
 
     def stretch(self, trial: IndependentTrial, factor: float) -> IndependentTrial:  # noqa: D102

@@ -135,8 +135,8 @@ class Criteria:
 
     def after_accepted(self, trial: Trial, best: Trial) -> Termination | None:
         """Return why to stop after a step from ``best`` to ``trial``."""
-        if trial.settled is not None:
-            return Termination.COST_CONVERGED if trial.settled else None
+        if trial.all_converged is not None:
+            return Termination.COST_CONVERGED if trial.all_converged else None
         tolerance = self._options.function_tolerance
         if is_beyond_cost(trial, best):  # if configured, continue as long as the gradient decreases
             before, self._promised = self._promised, trial.promised
@@ -151,8 +151,8 @@ class Criteria:
     def after_refused(self, trial: Trial, best: Trial) -> Termination | None:
         """Return why to stop after a step that was refused."""
         self.fell = 0.0
-        if trial.settled is not None:
-            return Termination.COST_CONVERGED if trial.settled else None
+        if trial.all_converged is not None:
+            return Termination.COST_CONVERGED if trial.all_converged else None
         if trial.promised <= self._options.function_tolerance * best.cost:
             return Termination.COST_CONVERGED  # even as promised the step would have ended the solve
         return Termination.DAMPING_EXHAUSTED if trial.relative_length <= NO_CHANGE else None

@@ -6,7 +6,7 @@
     open the parts, agree on the cameras
     for every loss
         solve                                             (a checkpoint after every step)
-        bring lines back that settled in wrong places     (each part on its own)
+        bring lines back from wrong minima             (each part on its own)
     write the parts
 """
 

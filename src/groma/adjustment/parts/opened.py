@@ -32,7 +32,7 @@ from groma.adjustment.parts.communication import agreed, exchange
 from groma.adjustment.parts.same_scene import check_same_scene
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.adjustment.stages import with_loss
-from groma.adjustment.survey.place import moved_to, placement
+from groma.adjustment.survey.best_fit import best_fit, moved_to
 from groma.adjustment.terms.camera_poses import lengths_on_planes
 from groma.adjustment.terms.objects import with_held
 from groma.adjustment.terms.principal_points import is_prior, near_the_middle_if_guessed, observed_cameras
@@ -57,7 +57,7 @@ SHARED = ("frames", "sensors", "intrinsics", "planes", "directions", "control_po
 
 
 @dataclass(frozen=True)
-class Place:
+class PartReader:
     """How parts are read: near the origin of their world, and where measurements of other instruments fit best."""
 
     #: Moves a scene far from the origin of its world near to it.
@@ -93,7 +93,7 @@ class OpenParts:
     variables: dict[str, Variables]
     options: AssemblyOptions
     #: Where the parts are read to.
-    place: Place
+    reader: PartReader
     #: Of every part: see :func:`_facts`.
     facts: tuple[dict[str, Any], ...]
     num_images: int = 0
@@ -105,7 +105,7 @@ class OpenParts:
 
     def read(self, part: Part) -> Scene:
         """Read a part, near the origin."""
-        return self.place.read(part.path)
+        return self.reader.read(part.path)
 
     def assembled(self, part: Part, states: States | None = None, loss: Loss | None = None) -> tuple[Scene, Assembly]:
         """Return a part as a scene, and as a problem at given states of all variables of this process."""
@@ -174,15 +174,15 @@ def open_parts(paths: Sequence[Path], options: AssemblyOptions, reducer: Reducer
         sizes = [path.stat().st_size for path in paths]
     _check_same(reducer, [[path.name, size] for path, size in zip(paths, sizes, strict=True)])
     with agreed(reducer):
-        place = Place(local_frame(read_archive(paths[0])), None, options)
-        head = place.read(paths[0])
+        reader = PartReader(local_frame(read_archive(paths[0])), None, options)
+        head = reader.read(paths[0])
         _check_distances(paths[0], head)
         if options.refine_poses:
-            place = replace(place, fits=placement(head))
-            head = head if place.fits is None else moved_to(head, place.fits)
+            reader = replace(reader, fits=best_fit(head))
+            head = head if reader.fits is None else moved_to(head, reader.fits)
     mine = np.flatnonzero(_owners(sizes, reducer.size) == reducer.rank)
     with agreed(reducer):
-        parts, own, facts, count = _read_own(paths, mine.tolist(), options, (head, place))
+        parts, own, facts, count = _read_own(paths, mine.tolist(), options, (head, reader))
     told = {int(number): fact for part in exchange(reducer, facts) for number, fact in part.items()}
     ordered = tuple(told[number] for number in sorted(told))
     with agreed(reducer):
@@ -200,19 +200,19 @@ def open_parts(paths: Sequence[Path], options: AssemblyOptions, reducer: Reducer
         if unknown := sorted(used - shared.keys()):
             raise InputError(f"Parts cannot share these variables: {', '.join(unknown)}. Leave their options out.")
     variables = {name: group for name, group in shared.items() if name in used} | own
-    return OpenParts(tuple(paths), tuple(parts), variables, options, place, ordered, head.num_images)
+    return OpenParts(tuple(paths), tuple(parts), variables, options, reader, ordered, head.num_images)
 
 
 def _read_own(
-    paths: Sequence[Path], mine: list[int], options: AssemblyOptions, first: tuple[Scene, Place]
+    paths: Sequence[Path], mine: list[int], options: AssemblyOptions, first: tuple[Scene, PartReader]
 ) -> tuple[list[Part], dict[str, Variables], dict[int, dict[str, Any]], IntArray]:
     """Return the parts of this process, variables of theirs alone, facts by part, and what frames and cameras see."""
-    head, place = first
+    head, reader = first
     groups: dict[str, list[Variables]] = {}
     held: dict[str, Variables] = {}
     parts, facts, count = [], {}, np.zeros(head.num_frames + head.num_cameras, np.int64)
     for number in mine:
-        scene = place.read(paths[number])
+        scene = reader.read(paths[number])
         check_same_scene(paths[number], scene, paths[0], head, options.planes)
         made = _assembled(scene, options, number == 0)
         rows = {}

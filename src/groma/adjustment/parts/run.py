@@ -19,7 +19,7 @@ from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.adjustment.rescue.restart import renew_lines, with_seen_ends
 from groma.adjustment.rescue.slips import without_slips
 from groma.adjustment.stages import STAGES, one_after_another, stage_entries
-from groma.adjustment.survey.place import moved_to, placement
+from groma.adjustment.survey.best_fit import best_fit, moved_to
 from groma.adjustment.terms.objects import with_held_states
 from groma.factors.losses import GemanMcClure, Loss, Trivial
 from groma.gates import chi_square_gate
@@ -89,7 +89,7 @@ class Run:
             reports.append(report)
             if stopped:
                 break
-            states, moved = self._settled(states, losses[number], last, report.iterations)
+            states, moved = self._with_renewed_lines(states, losses[number], last, report.iterations)
             if moved and last:
                 reports[-1] = replace(report, final_cost=self._evaluate(states, losses[number]).final_cost)
         report, loss = one_after_another(reports), losses[len(reports) - 1]
@@ -134,8 +134,8 @@ class Run:
         options = replace(self.options, max_iterations=0)
         return solve_shards(variables, self.opened.shards(loss), options, reducer=self.reducer).report
 
-    def _settled(self, states: States, loss: Loss, last: bool, steps: int) -> tuple[States, bool]:
-        """Bring lines back that settled in wrong places, and return whether any process did; cameras are held.
+    def _with_renewed_lines(self, states: States, loss: Loss, last: bool, steps: int) -> tuple[States, bool]:
+        """Bring lines back from wrong minima, and return whether any process did; cameras are held.
 
         Lines are compared with those of their part.
         """
@@ -176,14 +176,14 @@ class Run:
         median = 2.0 ** (BIN_RANGE[0] + (middle + 0.5) * (BIN_RANGE[1] - BIN_RANGE[0]) / BINS)
         return max(loss.scale, STAGES.last_scale * float(np.sqrt(median / chi_square_gate(0.5, 2))))
 
-    def _place_of(self, solved: Solved) -> Similarity | None:
+    def _best_fit_of(self, solved: Solved) -> Similarity | None:
         """Return where measurements of other instruments fit best now, found by the process that has their part."""
         found, first = None, self.opened.paths[0]
         with agreed(self.reducer):
-            for part in self.opened.parts if self.opened.place.fits is not None else ():
+            for part in self.opened.parts if self.opened.reader.fits is not None else ():
                 if part.path == first:
                     scene, made = self.opened.assembled(part, solved.states, solved.loss)
-                    last = placement(disassemble(scene, made.problem))
+                    last = best_fit(disassemble(scene, made.problem))
                     assert last is not None
                     found = last.scale, last.rotation.tolist(), last.translation.tolist()
         told = next((one for one in exchange(self.reducer, found) if one), None)
@@ -191,7 +191,7 @@ class Run:
 
     def write(self, solved: Solved, output: Path) -> Written:
         """Write the parts of this process; return squared residuals and relations of all parts."""
-        own, opened, fits = {}, self.opened, self._place_of(solved)
+        own, opened, fits = {}, self.opened, self._best_fit_of(solved)
         with agreed(self.reducer):
             for part in opened.parts:
                 scene, made = opened.assembled(part, solved.states, solved.loss)
@@ -201,8 +201,8 @@ class Run:
                     adjusted = with_seen_ends(adjusted, moved)
                 if fits is not None:
                     adjusted = moved_to(adjusted, fits)
-                if opened.place.near is not None:
-                    adjusted = adjusted.transformed(opened.place.near.inverse())
+                if opened.reader.near is not None:
+                    adjusted = adjusted.transformed(opened.reader.near.inverse())
                 write_archive(adjusted, output / part.path.name, force=True)
                 squares = squared_residuals_px(made)
                 squares = {kind: [float(v.sum()), len(v)] for kind, v in squares.items()}

@@ -28,7 +28,7 @@ from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 
 
-def settle_clusters(scene: Scene, problem: Problem, threads: int | None = None) -> tuple[Problem, IntArray]:
+def renew_clusters(scene: Scene, problem: Problem, threads: int | None = None) -> tuple[Problem, IntArray]:
     """Return the problem with suspicious clusters at the better of two minima, and their lines that moved.
 
     Parameters
@@ -62,17 +62,17 @@ def settle_clusters(scene: Scene, problem: Problem, threads: int | None = None) 
         name: _joined(group, chosen[name], second[name]) if name in chosen else replace(group, constant=True)
         for name, group in variables.items()
     }
-    settled = solve(
+    solved = solve(
         Problem(starts, doubled), SolverOptions(max_iterations=GATES.max_steps, threads=threads)
     ).problem.variables
     ends = np.zeros(2 * count)
     mine = [label[kept] for label, kept in zip(labels, rows, strict=True) if len(kept)]
     for factor, label in zip(doubled, mine, strict=True):
-        ends += _costs(factor, np.concatenate([label, label + count]), 2 * count, settled)
+        ends += _costs(factor, np.concatenate([label, label + count]), 2 * count, solved)
     better: BoolArray = ends[count:] < ends[:count]
     states = {}
     for group, members in chosen.items():
-        first, other = np.split(settled[group].state, 2)
+        first, other = np.split(solved[group].state, 2)
         states[group] = variables[group].state.copy()
         states[group][members] = np.where(better[cluster[group][members]][:, None], other, first)
     moved = problem.with_states(states)

@@ -83,9 +83,9 @@ def renew_lines(scene: Scene, problem: Problem, threads: int | None = None) -> t
     held = {name: replace(problem.variables[name], constant=True) for name in used}
     starts = Problem({**held, "lines": _joined(lines, chosen, second)}, doubled)
     options = SolverOptions(max_iterations=GATES.max_steps, threads=threads)
-    settled = solve(starts, options).problem
-    first, other = np.split(settled.variables["lines"].state, [len(lines)])
-    cost = _line_costs(settled, doubled)[0] if len(chosen) else np.zeros(len(lines))
+    solved = solve(starts, options).problem
+    first, other = np.split(solved.variables["lines"].state, [len(lines)])
+    cost = _line_costs(solved, doubled)[0] if len(chosen) else np.zeros(len(lines))
     better: BoolArray = cost[len(lines) :] < cost[chosen]
     first = first.copy()
     first[chosen[better]] = other[better]

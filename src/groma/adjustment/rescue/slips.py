@@ -72,11 +72,11 @@ def without_slips(problem: Problem, threads: int | None = None) -> tuple[Problem
     used = {ref.group for factor in factors for _, ref in factor.references()} - {"lines"}
     held = {name: replace(problem.variables[name], constant=True) for name in used}
     options = SolverOptions(max_iterations=RESTART_GATES.max_steps, threads=threads)
-    settled = solve(Problem({**held, "lines": lines}, factors), options).problem.variables["lines"]
-    before, after = (group.ambient()[mine, 3:] for group in (lines, settled))
+    solved = solve(Problem({**held, "lines": lines}, factors), options).problem.variables["lines"]
+    before, after = (group.ambient()[mine, 3:] for group in (lines, solved))
     sine = np.linalg.norm(np.cross(before, after), axis=1)
     turned = sine > RESTART_GATES.elsewhere * np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
-    return Problem({**problem.variables, "lines": settled}, problem.factors), mine[turned]
+    return Problem({**problem.variables, "lines": solved}, problem.factors), mine[turned]
 
 
 def _slipped(problem: Problem, factors: list[Observing]) -> list[BoolArray]:

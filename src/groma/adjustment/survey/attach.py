@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from groma._typing import BoolArray
 from groma.adjustment.survey.given import Survey
-from groma.adjustment.survey.in_place import placing
+from groma.adjustment.survey.in_frame import placing
 from groma.adjustment.survey.objects import (
     direction_table,
     distance_table,

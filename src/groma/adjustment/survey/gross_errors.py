@@ -123,10 +123,10 @@ def _no_longer_checked(before: Reliability | None, after: Reliability, size: flo
     """
     if before is None:
         return set()
-    share = {(one.place, one.coordinate): one.redundancy for one in before.measurements}
-    pairs = [(one, share[one.place, one.coordinate]) for one in after.measurements if not one.is_rejected]
+    share = {(one.table_row, one.coordinate): one.redundancy for one in before.measurements}
+    pairs = [(one, share[one.table_row, one.coordinate]) for one in after.measurements if not one.is_rejected]
     least = (rejection_limit(after.measurements) / size) ** 2
-    return {one.place[0] for one, had in pairs if had > GATES.checked and one.redundancy < least * had}
+    return {one.table_row[0] for one, had in pairs if had > GATES.checked and one.redundancy < least * had}
 
 
 def _at_full_weight(problem: Problem | None) -> Problem | None:

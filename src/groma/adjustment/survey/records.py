@@ -69,7 +69,7 @@ class Measurement:
     is_rejected: bool = False
 
     @property
-    def place(self) -> tuple[str, int]:
+    def table_row(self) -> tuple[str, int]:
         """Table of the scene and row in it."""
         return TABLES[self.kind], self.row
 
@@ -139,7 +139,7 @@ def gross_errors(measurements: Sequence[Measurement]) -> dict[tuple[str, int], f
     That noise is the stated one, or a larger one that the kind itself shows by the median of its normalised residuals:
     where all are worse than stated, none is a gross error for that. The values are the largest normalised residuals.
     """
-    tests = [(one.kind, one.place, abs(one.normalized)) for one in measurements if one.normalized is not None]
+    tests = [(one.kind, one.table_row, abs(one.normalized)) for one in measurements if one.normalized is not None]
     limit = rejection_limit(measurements)
     found: dict[tuple[str, int], float] = {}
     for kind in dict.fromkeys(kind for kind, _, _ in tests):

@@ -40,8 +40,8 @@ import scipy  # its parts are imported when something of them is first used
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
-from groma.adjustment.places import at_places_of
-from groma.adjustment.survey.place import moved, weighted
+from groma.adjustment.moved_problem import problem_at
+from groma.adjustment.survey.best_fit import moved, weighted
 from groma.adjustment.survey.records import (
     GATES,
     TABLES,
@@ -116,7 +116,7 @@ def reliability(
     if problem is None:
         problem = assemble(scene, AssemblyOptions()).problem
     elif near is not None:
-        problem = at_places_of(problem, scene)
+        problem = problem_at(problem, scene)
     entries = list(_entries(accepted(scene), problem.factors, problem.variables))
     frame = _frame(problem, [factor for _, _, factor in entries])
     tests = [_tested(frame, *entry) for entry in entries]

@@ -13,7 +13,7 @@ With places :math:`x_i` of the information :math:`W_i` about their weighted mean
 Where that is too far from 1, the distance between two frames is held at what it is at the start, with as much
 information as brings it near 1. Relations then say nothing of the scale, as in a scene without such measurements
 (:func:`~groma.adjustment.assemble.first_camera_gauge`); where others than poses tell it, the whole scene gets it from
-them before and after (:func:`~groma.adjustment.survey.place.settled`).
+them before and after (:func:`~groma.adjustment.survey.best_fit.best_fitted`).
 """
 
 from __future__ import annotations

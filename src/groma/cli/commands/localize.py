@@ -12,8 +12,8 @@ from groma.cli.shared import options as _options
 from groma.cli.shared.console import Console
 
 if TYPE_CHECKING:
-    from groma.localization.placed import PlacedImage
     from groma.localization.result import LocalizeResult
+    from groma.localization.stored import StoredImage
 
 #: Localised photographs in the table; the others are always listed (convention: what a screen can hold).
 _SHOWN = 12
@@ -133,7 +133,7 @@ def _say(console: Console, result: "LocalizeResult") -> None:
     console.say(f"{counted(len(found), 'photographs')}: {numbers}.")
 
 
-def _row(one: "PlacedImage") -> tuple[str, ...]:
+def _row(one: "StoredImage") -> tuple[str, ...]:
     numbers = one.to_dict()
     sigma, turn = numbers["center_sigma"], numbers["rotation_sigma_deg"]
     center = "" if sigma is None else f"{sum(value * value for value in sigma) ** 0.5:.2g}"

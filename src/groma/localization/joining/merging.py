@@ -26,11 +26,11 @@ from groma.geometry.so3 import hat
 from groma.localization.joining.measurements import with_measurements_of
 from groma.localization.localizer import LocalizedImage, Localizer
 from groma.localization.map_index import Progress
-from groma.localization.placed import PlacedImage
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.verdict import moved as way_between
 from groma.localization.posed_model import gather_photographs, with_photographs
+from groma.localization.stored import StoredImage
 from groma.mapping.carried.kept_lines import with_lines_of
 from groma.mapping.noise.landmarks import project_points
 from groma.mapping.photographs import content_digest
@@ -121,9 +121,9 @@ def merged_model(first: Localizer, second: Localizer, folder: Path, kind: Kind, 
     digests = [content_digest(path) for path in second.files]
     is_fresh = np.array([digest not in known for digest in digests])
     fresh = np.flatnonzero(is_fresh).tolist()
-    placed = [_as_placed(moved, row, poses.get(row)) for row in fresh]
+    stored = [_as_stored(moved, row, poses.get(row)) for row in fresh]
     paths = [*first.files, *(second.files[row] for row in fresh)]
-    scene = with_photographs(first.scene, first.index, placed, paths, say)
+    scene = with_photographs(first.scene, first.index, stored, paths, say)
     gather_photographs(folder, dict(zip(scene.images.names, paths, strict=True)))
     place = {row: first.scene.num_images + number for number, row in enumerate(fresh)}
     images = np.array([place.get(row, known.get(digest, 0)) for row, digest in enumerate(digests)])
@@ -282,12 +282,12 @@ def _pose_of(moved: Scene, image: int, found: LocalizedImage) -> FloatArray:
     return own if agree.sum() > pose.point_inliers.sum() else pose.cam_from_world
 
 
-def _as_placed(scene: Scene, image: int, pose: FloatArray | None) -> PlacedImage:
+def _as_stored(scene: Scene, image: int, pose: FloatArray | None) -> StoredImage:
     """An image of a scene as a photograph with a pose, its own unless another is given."""
     camera = QueryCamera.of(scene.cameras, int(scene.images.camera_idx[image]))
     none = np.zeros(0, np.int64)
     own = scene.cam_from_world[image] if pose is None else pose
-    return PlacedImage(
+    return StoredImage(
         scene.images.names[image], "localized", "", own, np.zeros((6, 6)), camera.model,
         camera.params, np.array([camera.width, camera.height]), none, np.zeros((0, 2)), none, np.zeros((0, 4)), 0.0,
     )  # fmt: skip

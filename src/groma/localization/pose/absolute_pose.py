@@ -21,8 +21,8 @@ from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import max_errors, propose, straightened
 from groma.localization.pose.lens import lens_step
 from groma.localization.pose.matches import Matches
-from groma.localization.pose.places import Place, weighed
 from groma.localization.pose.refinement import Refined, cells_of, fitted_at, refine
+from groma.localization.pose.sites import Site, weighed
 from groma.localization.pose.verdict import (
     Evidence,
     Instead,
@@ -238,7 +238,7 @@ def pose_from_matches(
         return _failed(camera, matches)
     first = evidence_of(best, matches, places)
 
-    def near(start: Refined) -> Place:
+    def near(start: Refined) -> Site:
         assert guided is not None
         used, lens = guided(start), options.lens_of(camera)
         errors = _errors(used, options)
@@ -246,10 +246,10 @@ def pose_from_matches(
         own = fitted_at(best.one.at(whole.pose, whole.camera.params), whole.camera, matches, errors, lens)
         return seen(whole, used, own, evidence_of(own, matches, places))
 
-    def seen(whole: Refined, used: Matches, own: Refined, evidence: Evidence) -> Place:
+    def seen(whole: Refined, used: Matches, own: Refined, evidence: Evidence) -> Site:
         if expected is None or not evidence.significant or evidence.agree < enough:
-            return Place(whole, used, own, evidence)
-        return Place(whole, used, own, evidence, expected(whole, used))
+            return Site(whole, used, own, evidence)
+        return Site(whole, used, own, evidence, expected(whole, used))
 
     here = near(best) if guided is not None and first.significant else seen(best, matches, best, first)
     if here.evidence.agree < enough:
@@ -260,7 +260,7 @@ def pose_from_matches(
 
 
 def _judged(
-    here: Place,
+    here: Site,
     others: list[Instead],
     rival: FloatArray | None,
     matches: Matches,
@@ -301,7 +301,7 @@ def _judged(
 
 
 def _unless_mirrored(
-    verdict: Verdict, here: Place, mirror: MirrorQuestions, matches: Matches, options: PoseOptions
+    verdict: Verdict, here: Site, mirror: MirrorQuestions, matches: Matches, options: PoseOptions
 ) -> Verdict:
     """Return a verdict, or another one where the mirror image of a photograph fits about as well, and by matches that
     are more alike.

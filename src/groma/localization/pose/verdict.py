@@ -186,7 +186,7 @@ def judge(
     return Verdict("localized", probability, f"{agree} agree.")
 
 
-def second_place(first: Evidence, second: Evidence, odds: float) -> Instead:
+def second_site(first: Evidence, second: Evidence, odds: float) -> Instead:
     """Return that another place of the map, which something agrees with as well, is shown."""
     words = (
         f"Two places fit about equally well: {first.agree} measurements speak for this one, {second.agree} for "
@@ -207,7 +207,7 @@ def pieces_of_others(agree: int, elsewhere: int, telling: tuple[int, int]) -> In
     return Instead(odds, words, elsewhere > agree)
 
 
-def place_not_in_map(agree: int, again: int, shown: Shown) -> Instead:
+def site_not_in_map(agree: int, again: int, shown: Shown) -> Instead:
     """Return that a place is shown which the map does not have; of the cells that agree it has so many ``again``."""
     again = min(again, agree)
     odds = again / max(agree, 1) * float(_tail(again, agree - again))

@@ -7,8 +7,8 @@ Stages, each on all images before the next begins:
 2. segments without distortion, with the depths at which to look for them (:mod:`groma.mapping.lines.views`), and how
    vanishing points say that the depth changes along them (:mod:`groma.mapping.lines.hypotheses.directions`);
 3. the place of every segment in space, on which most of its neighbours agree
-   (:mod:`groma.mapping.lines.hypotheses.places`);
-4. lines: segments whose places agree, and what else lies on them (:mod:`groma.mapping.lines.linking.growth`);
+   (:mod:`groma.mapping.lines.hypotheses.positions`);
+4. lines: segments whose positions agree, and what else lies on them (:mod:`groma.mapping.lines.linking.growth`);
 5. lines that were mapped more than once are joined (:mod:`groma.mapping.lines.linking.merge`);
 6. filters: seen by enough images, well determined, no texture, no duplicate, long enough
    (:mod:`groma.mapping.lines.filtering.filters`).
@@ -34,7 +34,7 @@ from groma.mapping.lines.collect import line_map_of
 from groma.mapping.lines.filtering.filters import Evidence, filtered
 from groma.mapping.lines.hypotheses.directions import depth_ratios
 from groma.mapping.lines.hypotheses.earlier import EarlierMap
-from groma.mapping.lines.hypotheses.places import find_places
+from groma.mapping.lines.hypotheses.positions import find_positions
 from groma.mapping.lines.line_map import LineMap
 from groma.mapping.lines.linking.growth import grow
 from groma.mapping.lines.linking.merge import merge_agreeing
@@ -118,8 +118,8 @@ def map_lines(
         else:
             ratios = depth_ratios(scene, segments, views)
         proposing, linking = partial(report, "proposing lines"), partial(report, "linking segments")
-        places = find_places(scene, views, ratios, compared, matches, options, proposing, known)
-        unmerged = grow(Tracks.none(views, places.rejection), places, compared, options, linking)
+        positions = find_positions(scene, views, ratios, compared, matches, options, proposing, known)
+        unmerged = grow(Tracks.none(views, positions.rejection), positions, compared, options, linking)
         evidence = Evidence(
             options=options,
             neighbors=compared,
@@ -129,4 +129,4 @@ def map_lines(
         )
         tracks = filtered(merge_agreeing(unmerged), evidence)
         rows = np.arange(len(views.image_idx))
-        return line_map_of(tracks, rows, views.pointers, tracks.outcomes(), compared, places, ratios)
+        return line_map_of(tracks, rows, views.pointers, tracks.outcomes(), compared, positions, ratios)

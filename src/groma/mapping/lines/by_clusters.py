@@ -4,8 +4,8 @@
 Images are divided into clusters of covisibility, each with a ring of neighbours around it
 (:mod:`groma.mapping.lines.clusters`). A cluster is two pieces of work, which any process may do:
 
-1. the places in space of the segments of its images, for which the segments of the ring are needed as well;
-2. lines of these and of the ring: linked, fitted, merged and filtered as the lines of a whole scene are. The places of
+1. the positions in space of the segments of its images, for which the segments of the ring are needed as well;
+2. lines of these and of the ring: linked, fitted, merged and filtered as the lines of a whole scene are. Positions of
    the segments of the ring come from the clusters that these belong to.
 
 A line that runs across a border is found by the clusters on both sides, each with the segments that it knows. Versions
@@ -13,7 +13,7 @@ of one line are joined and fitted anew (:mod:`groma.mapping.lines.linking.border
 are estimated by each cluster from its own segments.
 
 The result depends on the size of clusters, not on who works on them. A process needs memory for one cluster and its
-ring; the one that puts lines together for all segments, their places and the lines.
+ring; the one that puts lines together for all segments, their positions and the lines.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from groma.mapping.lines.filtering.filters import NEARBY, Evidence, SegmentKinds
 from groma.mapping.lines.filtering.texture import num_expected
 from groma.mapping.lines.hypotheses.directions import depth_ratios
 from groma.mapping.lines.hypotheses.earlier import EarlierMap
-from groma.mapping.lines.hypotheses.places import Places, find_places
+from groma.mapping.lines.hypotheses.positions import SegmentPositions, find_positions
 from groma.mapping.lines.line_map import LineMap
 from groma.mapping.lines.linking.borders import Borders, Found, joined
 from groma.mapping.lines.linking.growth import grow
@@ -64,7 +64,7 @@ def map_lines_by_clusters(
     pointers = pointers_of([len(one) for one in segments])
     count = -(-scene.num_images // options.cluster_size)
     whole = _Whole(scene, segments, neighbors, options)
-    without_points = replace(whole, scene=scene.keep(points=[]))  # places are all that they tell
+    without_points = replace(whole, scene=scene.keep(points=[]))  # positions are all that they tell
     cut = clusters(neighbors, count, pointers)
     own_rows = [rows_of_images(one.images, pointers) for one in cut]
 
@@ -72,13 +72,13 @@ def map_lines_by_clusters(
         part = _Part.of(cut[k], whole)
         return part, None if earlier is None else part.earlier(earlier)
 
-    placed = map_work(_places_of, _Made(asked, len(cut)), partial(progress, "proposing lines"))
-    places, ratios = _of_all(own_rows, placed)
+    of_parts = map_work(_positions_of, _Made(asked, len(cut)), partial(progress, "proposing lines"))
+    positions, ratios = _of_all(own_rows, of_parts)
 
-    def placed_part(k: int) -> tuple[_Part, Places]:
-        return _Part.of(cut[k], without_points), _known(cut[k], places)
+    def part_with_positions(k: int) -> tuple[_Part, SegmentPositions]:
+        return _Part.of(cut[k], without_points), _known(cut[k], positions)
 
-    found = map_work(_lines_of, _Made(placed_part, len(cut)), partial(progress, "linking segments"))
+    found = map_work(_lines_of, _Made(part_with_positions, len(cut)), partial(progress, "linking segments"))
     num_segments, num_images = int(pointers[-1]), scene.num_images
     outcomes, length = np.empty(num_segments, np.int64), np.empty(num_segments)
     home, known = np.empty(num_images, np.int64), np.zeros((len(cut), num_images), bool)
@@ -94,7 +94,7 @@ def map_lines_by_clusters(
     if options.min_repeatability > 0.0 and tracks.num_lines:
         tracks = tracks.keep(_is_edge(whole, tracks, rows, length, outcomes), Outcome.TEXTURE)
         outcomes[rows] = tracks.outcomes()
-    return line_map_of(tracks, rows, pointers, outcomes, neighbors, places, ratios)
+    return line_map_of(tracks, rows, pointers, outcomes, neighbors, positions, ratios)
 
 
 class _Made(Sequence[_Item]):
@@ -143,7 +143,7 @@ class _Part:
     """What a cluster is told, in its own numbers of images: so much is sent to another process."""
 
     cluster: Cluster
-    #: Cameras, and for places the points that they see, of the cluster's images and its ring; and their segments.
+    #: Cameras, and for positions the points that they see, of the cluster's images and its ring; and their segments.
     scene: Scene
     segments: list[Segments]
     #: Of each of these images, those among them.
@@ -176,7 +176,7 @@ class _Part:
         return EarlierMap(whole.scene.points_only().subset(known), part)
 
 
-def _places_of(asked: tuple[_Part, EarlierMap | None]) -> tuple[Places, FloatArray]:
+def _positions_of(asked: tuple[_Part, EarlierMap | None]) -> tuple[SegmentPositions, FloatArray]:
     """Places and changes of depth of the segments of the cluster's own images; supporters by their rows among all."""
     part, earlier = asked
     options = part.options
@@ -188,23 +188,27 @@ def _places_of(asked: tuple[_Part, EarlierMap | None]) -> tuple[Places, FloatArr
         ratios = earlier.lines.depth_ratios
     else:
         ratios = depth_ratios(part.scene, part.segments, views)
-    found = find_places(part.scene, views, ratios, near, None, options, lambda done, total: None, known)
+    found = find_positions(part.scene, views, ratios, near, None, options, lambda done, total: None, known)
     own = np.flatnonzero(part.is_own[views.image_idx])
     mine = found.take(own)
     return replace(mine, supporters=part.cluster.whole(mine.supporters).astype(np.int32)), ratios[own]
 
 
-def _of_all(own_rows: Sequence[IntArray], placed: Sequence[tuple[Places, FloatArray]]) -> tuple[Places, FloatArray]:
+def _of_all(
+    own_rows: Sequence[IntArray], of_parts: Sequence[tuple[SegmentPositions, FloatArray]]
+) -> tuple[SegmentPositions, FloatArray]:
     """Places and changes of depth of all segments."""
     order = np.argsort(np.concatenate(own_rows))
-    columns = {name: np.concatenate([getattr(one, name) for one, _ in placed])[order] for name in Places.names()}
-    return Places(**columns), np.concatenate([ratios for _, ratios in placed])[order]
+    columns = {
+        name: np.concatenate([getattr(one, name) for one, _ in of_parts])[order] for name in SegmentPositions.names()
+    }
+    return SegmentPositions(**columns), np.concatenate([ratios for _, ratios in of_parts])[order]
 
 
-def _known(cluster: Cluster, whole: Places) -> Places:
-    """The places of the segments that a cluster knows; supporters by its own rows, none where it does not know them."""
-    places = whole.take(cluster.rows)
-    return replace(places, supporters=_known_rows(cluster, places.supporters, len(whole.found)))
+def _known(cluster: Cluster, whole: SegmentPositions) -> SegmentPositions:
+    """The positions of segments that a cluster knows; supporters by its own rows, none where it does not know them."""
+    positions = whole.take(cluster.rows)
+    return replace(positions, supporters=_known_rows(cluster, positions.supporters, len(whole.found)))
 
 
 def _known_rows(cluster: Cluster, rows: IntArray, count: int) -> IntArray:
@@ -214,13 +218,15 @@ def _known_rows(cluster: Cluster, rows: IntArray, count: int) -> IntArray:
     return cluster.row(np.where(known[rows], rows, -1))
 
 
-def _lines_of(asked: tuple[_Part, Places]) -> Found:
+def _lines_of(asked: tuple[_Part, SegmentPositions]) -> Found:
     """The lines of a cluster, which see a segment of its own images."""
-    part, places = asked
+    part, positions = asked
     options, rows = part.options, np.arange(len(part.cluster.rows))
     views = views_of_rows(part.scene, part.segments, rows, options.min_length, options.noise)
     own = part.is_own[views.image_idx]
-    unmerged = grow(Tracks.none(views, places.rejection), places, part.neighbors, options, lambda done, total: None)
+    unmerged = grow(
+        Tracks.none(views, positions.rejection), positions, part.neighbors, options, lambda done, total: None
+    )
     evidence = Evidence(
         options=options,
         neighbors=part.neighbors,

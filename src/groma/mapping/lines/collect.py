@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The result of mapping lines, collected from finished tracks and the places of all segments."""
+"""The result of mapping lines, collected from finished tracks and the positions of all segments."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.mapping.lines.hypotheses.places import Places
+from groma.mapping.lines.hypotheses.positions import SegmentPositions
 from groma.mapping.lines.line_map import LineMap
 from groma.mapping.lines.linking.tracks import Tracks
 from groma.scene import Lines
@@ -20,7 +20,7 @@ def line_map_of(
     pointers: IntArray,
     outcomes: IntArray,
     neighbors: list[IntArray],
-    places: Places,
+    positions: SegmentPositions,
     ratios: FloatArray,
 ) -> LineMap:
     """Collect the result; lines run like most of their segments.
@@ -35,7 +35,7 @@ def line_map_of(
         Rows of each image among all segments.
     outcomes : (S,) int
         The outcome of each of all segments.
-    neighbors, places, ratios
+    neighbors, positions, ratios
         Of all images and segments.
     """
     views = tracks.views
@@ -58,8 +58,8 @@ def line_map_of(
         uncertainty=tracks.uncertainty,
         outcomes=tuple(outcomes[first:last] for first, last in pairwise(pointers)),
         neighbors=tuple(neighbors),
-        supporters=places.supporters.astype(np.int32),
-        rejection=places.rejection,
+        supporters=positions.supporters.astype(np.int32),
+        rejection=positions.rejection,
         depth_ratios=ratios,
     )
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""From the places of single segments to lines that many images see, step by step.
+r"""From the positions of single segments to lines that many images see, step by step.
 
 link
-    Segments whose places support each other become lines (:mod:`groma.mapping.lines.linking.link`).
+    Segments whose positions support each other become lines (:mod:`groma.mapping.lines.linking.link`).
 scale the noise
     The standard deviations of all segments are scaled to what the residuals of the first lines show.
 recover
@@ -27,7 +27,7 @@ from groma.execution import map_work
 from groma.features.segments import SEGMENTS
 from groma.mapping.groups import distinct_pairs
 from groma.mapping.lines.gates import AGREEMENT
-from groma.mapping.lines.hypotheses.places import Places
+from groma.mapping.lines.hypotheses.positions import SegmentPositions
 from groma.mapping.lines.linking.fit import find_on_lines, near_together
 from groma.mapping.lines.linking.link import link
 from groma.mapping.lines.linking.tracks import Tracks
@@ -37,15 +37,15 @@ from groma.mapping.lines.options import MapLinesOptions
 # ---------------------------------------------------------------------------------------------------------------- steps
 def grow(
     tracks: Tracks,
-    places: Places,
+    positions: SegmentPositions,
     neighbors: list[IntArray],
     options: MapLinesOptions,
     progress: Callable[[int, int], None],
 ) -> Tracks:
-    """Return the lines that places make and the segments on them, in the order in which this file describes."""
+    """Return the lines that positions make and the segments on them, in the order in which this file describes."""
 
     def link_free(now: Tracks) -> Tracks:
-        return linked(now, places)
+        return linked(now, positions)
 
     def recover(now: Tracks) -> Tracks:
         return recovered(now, neighbors, options.directed)
@@ -66,12 +66,12 @@ def grow(
     return tracks
 
 
-def linked(tracks: Tracks, places: Places) -> Tracks:
-    """Return the tracks with lines of the free segments whose places agree."""
+def linked(tracks: Tracks, positions: SegmentPositions) -> Tracks:
+    """Return the tracks with lines of the free segments whose positions agree."""
     views = tracks.views
     free = views.usable & (tracks.line_of < 0)
-    members, representative = link(views, tracks.sigma, places, free, AGREEMENT.max_squared(2))
-    return tracks.with_groups(members, representative, places.ends_in_space(views))
+    members, representative = link(views, tracks.sigma, positions, free, AGREEMENT.max_squared(2))
+    return tracks.with_groups(members, representative, positions.ends_in_space(views))
 
 
 def with_own_noise(tracks: Tracks, bounds: tuple[float, float]) -> Tracks:

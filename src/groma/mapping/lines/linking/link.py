@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Segments whose places agree are joined into groups, the first form of a line.
+r"""Segments whose positions agree are joined into groups, the first form of a line.
 
-In come the places of single segments and the segments that support each of them. An edge links two segments if the
+In come the positions of single segments and the segments that support each of them. An edge links two segments if the
 place of each projects onto the other's line within
 
 .. math:: d^2 \le \chi^2\,\big(\sigma_b^2 ((1 - t)^2 + t^2) + \sigma_a^2 + (\partial d/\partial q)^2 \sigma_q^2\big)
@@ -18,7 +18,7 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_ranges
-from groma.mapping.lines.hypotheses.places import Places
+from groma.mapping.lines.hypotheses.positions import SegmentPositions
 from groma.mapping.lines.views import LineViews
 
 #: Pairs of segments compared by one piece of work (cost: time only).
@@ -53,7 +53,7 @@ def _explains(P, center, ray, q, variance1, variance2, sigma_a, line, ends, sigm
 
 @kernel
 def _agree(s, r, camera, center, image, ray, q, covariance, sigma, line, ends, gate):
-    """Whether the places of two segments explain each other."""
+    """Whether the positions of two segments explain each other."""
     for _ in range(2):
         if not _explains(
             camera[image[r]], center[image[s]], ray[s], q[s], covariance[s, 0], covariance[s, 2], sigma[s], line[r],
@@ -74,7 +74,7 @@ def _root(parent, s):
 
 @loop
 def _join(edges, camera, center, image, ray, q, covariance, sigma, line, ends, gate, agree, rank, parent):
-    """Whether the places at both ends of each edge explain each other.
+    """Whether the positions at both ends of each edge explain each other.
 
     With ``parent``, those of the groups that both ends are in, which are then joined, best edges first; a group stands
     for itself by its member of highest rank.
@@ -95,9 +95,9 @@ def _join(edges, camera, center, image, ray, q, covariance, sigma, line, ends, g
 
 # ------------------------------------------------------------------------------------------------------------- Public
 def link(
-    views: LineViews, sigma: FloatArray, places: Places, free: BoolArray, max_squared: float
+    views: LineViews, sigma: FloatArray, positions: SegmentPositions, free: BoolArray, max_squared: float
 ) -> tuple[IntArray, IntArray]:
-    """Join segments whose places agree.
+    """Join segments whose positions agree.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def link(
         Segments of all images.
     sigma : (S,) float64
         Standard deviations of the segments across, pixels.
-    places : Places
+    positions : SegmentPositions
         Place of each segment, its support, and the segments that support it.
     free : (S,) bool
         Segments that may be used.
@@ -117,12 +117,12 @@ def link(
     members, representative : (m,) int
         Rows of the segments in groups of two and more, and the row that stands for each one's group.
     """
-    edges = places.edges[free[places.edges].all(axis=1)]
+    edges = positions.edges[free[positions.edges].all(axis=1)]
     tables = (
-        views.camera, views.center, views.image_idx, views.ray, places.q, places.covariance, sigma, views.line,
+        views.camera, views.center, views.image_idx, views.ray, positions.q, positions.covariance, sigma, views.line,
         views.ends,
     )  # fmt: skip
-    agree, rank = np.zeros(len(edges), bool), places.score * np.sqrt(views.length)
+    agree, rank = np.zeros(len(edges), bool), positions.score * np.sqrt(views.length)
 
     def compare(part: slice) -> None:
         _join(edges[part], *tables, max_squared, agree[part], rank, np.empty(0, np.int64))

@@ -9,7 +9,7 @@ from groma.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedPhotographs:
+class RegisteredPhotographs:
     """A scene of photographs with points."""
 
     #: Poses, points, and given poses as measurements where there are any.

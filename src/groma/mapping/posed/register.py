@@ -32,7 +32,7 @@ from groma.mapping.noise.observations import noise_px
 from groma.mapping.posed.axes import check_axes
 from groma.mapping.posed.motions import Motions, motions_of
 from groma.mapping.posed.noise import GivenNoise, noise_of_given
-from groma.mapping.posed.placed import PlacedPhotographs
+from groma.mapping.posed.registered import RegisteredPhotographs
 from groma.mapping.posed.sentences import about_gross_errors, about_left_out, about_noise
 from groma.scene import PosePriors, Scene, Similarity
 from groma.scene.local_frame import usual_frame
@@ -78,7 +78,7 @@ class GivenPoses:
         return PosePriors(rows, self.poses[rows], np.tile(np.repeat(self.sigma, 3), (len(rows), 1)))
 
 
-def place_photographs(
+def register_photographs(
     images: Path,
     work: Path,
     given: Scene,
@@ -87,7 +87,7 @@ def place_photographs(
     refine_intrinsics: bool = False,
     max_iterations: int = 50,  # derived from MapOptions
     say: Say = lambda doing, done, total: None,
-) -> PlacedPhotographs:
+) -> RegisteredPhotographs:
     """Find points and better poses of photographs.
 
     Parameters
@@ -137,12 +137,12 @@ def place_photographs(
     )
     for number, tolerance in enumerate(GATES.tolerances_px):
         say("placing points at the poses", number, rounds)
-        found = _with_missing_placed(photographs, photographs.triangulate(found, tolerance))
+        found = _with_missing_registered(photographs, photographs.triangulate(found, tolerance))
         found, known = _adjusted(found, known, how, number > 0)
     return _told(found, known, near)
 
 
-def _told(found: Scene, known: GivenPoses | None, near: Similarity | None) -> PlacedPhotographs:
+def _told(found: Scene, known: GivenPoses | None, near: Similarity | None) -> RegisteredPhotographs:
     """Return the images that see points, in the frame of the given poses, with messages."""
     names, seen = found.images.names, _num_points_seen(found) >= MIN_MATCHES
     if seen.sum() < 2:
@@ -157,7 +157,7 @@ def _told(found: Scene, known: GivenPoses | None, near: Similarity | None) -> Pl
         warnings = about_gross_errors(names, known.gross & seen, found, known.poses, unit) + warnings
         found = found.replace(pose_priors=known.priors())
     found = found.subset(np.flatnonzero(seen), min_observations=2)
-    return PlacedPhotographs(
+    return RegisteredPhotographs(
         found if near is None else found.transformed(near.inverse()), tuple(notes), tuple(warnings)
     )
 
@@ -206,7 +206,7 @@ def _compared(poses: FloatArray, covariance: FloatArray, known: GivenPoses) -> G
     return GivenPoses(known.poses, told[0], told[1], (sigma[0], sigma[1]))
 
 
-def _with_missing_placed(photographs: PosedPhotographs, scene: Scene) -> Scene:
+def _with_missing_registered(photographs: PosedPhotographs, scene: Scene) -> Scene:
     """Return the scene with images that see too few points placed by the points of the others."""
     poses = scene.cam_from_world
     for row in np.flatnonzero(_num_points_seen(scene) < MIN_MATCHES).tolist():

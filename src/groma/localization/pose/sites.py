@@ -21,12 +21,12 @@ from groma.localization.pose.verdict import (
     Shown,
     as_good,
     pieces_of_others,
-    place_not_in_map,
-    second_place,
+    second_site,
+    site_not_in_map,
 )
 
 
-class Place(NamedTuple):
+class Site(NamedTuple):
     """A pose: fitted to all that is near, and at that pose fitted to what was matched without it."""
 
     best: Refined
@@ -55,13 +55,13 @@ class Place(NamedTuple):
 
 
 def weighed(
-    here: Place,
+    here: Site,
     other: tuple[Refined, Evidence] | None,
-    near: Callable[[Refined], Place] | None,
+    near: Callable[[Refined], Site] | None,
     matches: Matches,
     in_map: bool,
     telling: Callable[[Matches], BoolArray] | None = None,
-) -> tuple[Place, Place | None, list[Instead]]:
+) -> tuple[Site, Site | None, list[Instead]]:
     """Return the more probable one of two places, the other one, and what a photograph may show instead of the first.
 
     Parameters
@@ -82,15 +82,15 @@ def weighed(
     agree, again = here.evidence.agree, here.elsewhere(matches, np.zeros((0, 2)))
     there, odds = None, 0.0
     if other is not None:
-        again, there = max(again, other[1].agree), Place(other[0], matches, *other)
+        again, there = max(again, other[1].agree), Site(other[0], matches, *other)
         votes, told = as_good(here.evidence, other[1]), -here.shown.log_odds
         if near is not None and votes * math.exp(min(max(told, 0.0), 600.0)) > 1.0 - VERDICT.right:
             there = near(other[0])
         odds = votes * math.exp(min(told + there.shown.log_odds, 600.0))
-    unseen = place_not_in_map(agree, again, here.shown) if in_map else Instead(0.0, "")
+    unseen = site_not_in_map(agree, again, here.shown) if in_map else Instead(0.0, "")
     if near is not None and there is not None and odds > 1.0:
         here, there, odds, unseen = there, here, 1.0 / odds, unseen._replace(odds=unseen.odds / odds)
     others = [unseen, here.pieces(matches, telling)]
     if there is not None:
-        others.append(second_place(here.evidence, there.evidence, odds))
+        others.append(second_site(here.evidence, there.evidence, odds))
     return here, there, others

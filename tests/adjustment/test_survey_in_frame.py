@@ -10,7 +10,7 @@ from _survey import ELSEWHERE, SIGMA, control_file, made, measured_positions, pl
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
-from groma.adjustment.places import at_places_of
+from groma.adjustment.moved_problem import problem_at
 from groma.adjustment.survey.align import align
 from groma.adjustment.survey.attach import Survey, with_survey
 from groma.adjustment.survey.reliability import reliability
@@ -107,7 +107,7 @@ def test_a_solved_problem_keeps_its_residuals_where_it_is_moved(truth_and_start)
     truth, _ = truth_and_start
     scene = with_everything(truth, np.random.default_rng(1))
     problem = assemble(scene, AssemblyOptions()).problem
-    moved = at_places_of(problem, scene.transformed(Similarity(translation=UTM)))
+    moved = problem_at(problem, scene.transformed(Similarity(translation=UTM)))
     for before, after in zip(problem.factors, moved.factors, strict=True):
         old, new = (residuals_of(f, p.variables) for f, p in ((before, problem), (after, moved)))
         np.testing.assert_allclose(new, old, atol=2e-5)

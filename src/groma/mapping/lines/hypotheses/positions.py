@@ -31,7 +31,7 @@ from groma.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class SegmentPositions:
     """Where the segments (S,) of all images, or of some, lie in space."""
 
     #: (S,) whether enough neighbours agree on a place.
@@ -48,9 +48,9 @@ class Places:
     rejection: IntArray
 
     @staticmethod
-    def none(count: int, width: int, rejection: Outcome) -> Places:
-        """No places, for this reason, of so many segments with room for so many supporters."""
-        return Places(
+    def none(count: int, width: int, rejection: Outcome) -> SegmentPositions:
+        """No positions, for this reason, of so many segments with room for so many supporters."""
+        return SegmentPositions(
             found=np.zeros(count, bool),
             q=np.zeros((count, 2)),
             covariance=np.zeros((count, 3)),
@@ -62,23 +62,23 @@ class Places:
     @staticmethod
     def names() -> tuple[str, ...]:
         """The columns."""
-        return tuple(item.name for item in fields(Places))
+        return tuple(item.name for item in fields(SegmentPositions))
 
-    def where(self, chosen: BoolArray, other: Places) -> Places:
-        """Return these places where chosen (S,), and those of another elsewhere."""
+    def where(self, chosen: BoolArray, other: SegmentPositions) -> SegmentPositions:
+        """Return these positions where chosen (S,), and those of another elsewhere."""
         columns = {}
         for name in self.names():
             one, two = getattr(self, name), getattr(other, name)
             columns[name] = np.where(chosen.reshape(-1, *[1] * (one.ndim - 1)), one, two)
-        return Places(**columns)
+        return SegmentPositions(**columns)
 
-    def take(self, rows: IntArray) -> Places:
-        """Return the places of some segments; supporters keep their numbers."""
-        return Places(**{name: getattr(self, name)[rows] for name in self.names()})
+    def take(self, rows: IntArray) -> SegmentPositions:
+        """Return the positions of some segments; supporters keep their numbers."""
+        return SegmentPositions(**{name: getattr(self, name)[rows] for name in self.names()})
 
     @cached_property
     def edges(self) -> IntArray:
-        """(E, 2) pairs of segments that have places, one of which supports the other; the smaller number first."""
+        """(E, 2) pairs of segments that have positions, one of which supports the other; the smaller number first."""
         first, which = np.nonzero(self.supporters >= 0)
         second = self.supporters[first, which]
         both = self.found[first] & self.found[second]
@@ -90,7 +90,7 @@ class Places:
         return center[:, None] + views.ray / np.where(self.found[:, None], self.q, 1.0)[:, :, None]
 
 
-def find_places(
+def find_positions(
     scene: Scene,
     views: LineViews,
     ratios: FloatArray,
@@ -99,7 +99,7 @@ def find_places(
     options: MapLinesOptions,
     progress: Callable[[int, int], None],
     known: Sequence[Known] | None = None,
-) -> Places:
+) -> SegmentPositions:
     """Return the place of every segment of every image.
 
     Parameters
@@ -123,15 +123,15 @@ def find_places(
     if calls and matches is None:
         parts = [_Part.of(cluster, proposer, work) for cluster in clusters(neighbors, calls, views.pointers)]
         in_order = np.argsort(np.concatenate([part.cluster.images for part in parts]))
-        by_part = [place for places in map_work(_places_of, parts, progress) for place in places]
+        by_part = [place for positions in map_work(_positions_of, parts, progress) for place in positions]
         found = [by_part[place] for place in in_order]
     else:
         sizes = [int(own) * len(others) for own, others in zip(np.diff(views.pointers), neighbors, strict=True)]
-        found = map_largest_first(partial(_places_in, proposer, matches), work, sizes, progress)
-    found = [Places.none(0, max(1, options.num_neighbors), Outcome.NO_MATCH), *found]
-    columns = {name: np.concatenate([getattr(one, name) for one in found]) for name in Places.names()}
+        found = map_largest_first(partial(_positions_in, proposer, matches), work, sizes, progress)
+    found = [SegmentPositions.none(0, max(1, options.num_neighbors), Outcome.NO_MATCH), *found]
+    columns = {name: np.concatenate([getattr(one, name) for one in found]) for name in SegmentPositions.names()}
     columns["rejection"][~views.usable] = Outcome.TOO_SHORT
-    return Places(**columns)
+    return SegmentPositions(**columns)
 
 
 #: Of one image: its number, neighbours, known points, and what else is known.
@@ -159,21 +159,21 @@ class _Part:
         return _Part(cluster, replace(proposer, views=views, ratios=proposer.ratios[cluster.rows]), mine)
 
 
-def _places_of(part: _Part) -> list[Places]:
+def _positions_of(part: _Part) -> list[SegmentPositions]:
     """The place of every segment of the images of a cluster."""
-    found = (_places_in(part.proposer, None, image) for image in part.images)
-    return [replace(places, supporters=part.cluster.whole(places.supporters)) for places in found]
+    found = (_positions_in(part.proposer, None, image) for image in part.images)
+    return [replace(positions, supporters=part.cluster.whole(positions.supporters)) for positions in found]
 
 
-def _places_in(
+def _positions_in(
     proposer: Proposer, matches: Mapping[tuple[int, int], LineMatches] | MatchProvider | None, image: _Image
-) -> Places:
+) -> SegmentPositions:
     """The same of one image."""
     views, (i, others, points, known) = proposer.views, image
     rows, width = views.rows(i), max(1, proposer.options.num_neighbors)
     count = rows.stop - rows.start
     if len(others) == 0:
-        return Places.none(count, width, Outcome.NO_NEIGHBOR)
+        return SegmentPositions.none(count, width, Outcome.NO_NEIGHBOR)
     if known is None:
         given = [_given(matches, i, int(j)) for j in others]
         for j, pairs in zip(others, given, strict=True):
@@ -189,8 +189,8 @@ def _places_in(
     return supported.where(supported.found, searched)
 
 
-def _agreed(proposer: Proposer, asked: Questions, width: int) -> Places:
-    """The places on which proposals agree, with room for so many supporters."""
+def _agreed(proposer: Proposer, asked: Questions, width: int) -> SegmentPositions:
+    """The positions on which proposals agree, with room for so many supporters."""
     options, others = proposer.options, asked.neighbors
     proposals = proposer.propose(asked)
     count = len(proposals.reached)
@@ -205,7 +205,9 @@ def _agreed(proposer: Proposer, asked: Questions, width: int) -> Places:
         [Outcome.NOT_LINKED, Outcome.AMBIGUOUS, Outcome.NO_SUPPORT, Outcome.DEGENERATE],
         Outcome.NO_MATCH,
     )
-    return Places(found, chosen.q, chosen.covariance, np.where(found, chosen.score, 0.0), supporters, rejection)
+    return SegmentPositions(
+        found, chosen.q, chosen.covariance, np.where(found, chosen.score, 0.0), supporters, rejection
+    )
 
 
 def _given(

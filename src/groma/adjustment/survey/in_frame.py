@@ -14,10 +14,10 @@ import numpy as np
 
 from groma._image_names import rows_by_name
 from groma._typing import FloatArray
+from groma.adjustment.survey.best_fit import measured_at_positions
 from groma.adjustment.survey.given import Survey
 from groma.adjustment.survey.level import check_directions, level
 from groma.adjustment.survey.orientations import check_orientations
-from groma.adjustment.survey.place import measured_at_places
 from groma.adjustment.survey.similarity import GATES, RobustSimilarity, robust_similarity, upright
 from groma.adjustment.survey.tables import listed
 from groma.adjustment.survey.triangulate import triangulated
@@ -193,7 +193,7 @@ def _scaled(scene: Scene, notes: list[str]) -> Similarity:
 
 def _ratios(scene: Scene) -> FloatArray:
     """Return by which factors measured distances differ from those of the scene, where it has them."""
-    table = measured_at_places(scene)
+    table = measured_at_positions(scene)
     points, _ = triangulated(scene, scene.marks, len(scene.control_points))
     places = {Kind.IMAGE: scene.cam_centers_in_world, Kind.CONTROL_POINT: points}
     ratios = []

@@ -23,7 +23,7 @@ from groma.problem.problem import Problem
 from groma.scene import Scene
 
 
-def at_places_of(problem: Problem, scene: Scene, shifted: bool = True) -> Problem:
+def problem_at(problem: Problem, scene: Scene, shifted: bool = True) -> Problem:
     """Return the problem with frames and landmarks where a scene has them.
 
     Where that is the same scene, its world shifted, what factors measure in the world is shifted with it; not if only

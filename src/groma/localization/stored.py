@@ -29,7 +29,7 @@ _FORMS = {
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedImage:
+class StoredImage:
     """A query and its place; empty arrays where it has none."""
 
     name: str
@@ -97,14 +97,14 @@ class PlacedImage:
             np.savez(file, **{"digest": np.array(digest), **arrays})  # type: ignore[arg-type]
 
 
-def placed(name: str, found: LocalizedImage) -> PlacedImage:
+def stored(name: str, found: LocalizedImage) -> StoredImage:
     """Return what is kept of a localised photograph."""
     pose, camera = found.pose, found.pose.camera
     lost = pose.cam_from_world is None or pose.covariance is None
     points, lines = np.flatnonzero(pose.point_inliers), np.flatnonzero(pose.line_inliers)
     if lost:
         points, lines = points[:0], lines[:0]
-    return PlacedImage(
+    return StoredImage(
         name,
         pose.status,
         pose.sentence,
@@ -124,16 +124,16 @@ def placed(name: str, found: LocalizedImage) -> PlacedImage:
     )
 
 
-def unreadable(name: str, reason: str) -> PlacedImage:
+def unreadable(name: str, reason: str) -> StoredImage:
     """Return what is told of a file that cannot be localised at all."""
     none = np.zeros(0, np.int64)
-    return PlacedImage(
+    return StoredImage(
         name, "failed", reason, np.zeros(0), np.zeros((0, 0)), "", np.zeros(0), np.zeros(2, np.int64),
         none, np.zeros((0, 2)), none, np.zeros((0, 4)), 0.0,
     )  # fmt: skip
 
 
-def read_placed(path: Path, digest: str) -> PlacedImage | None:
+def read_stored(path: Path, digest: str) -> StoredImage | None:
     """Read a query that was finished; None where there is none, or another map or photograph."""
     try:
         with opened_arrays(path) as members:
@@ -144,7 +144,7 @@ def read_placed(path: Path, digest: str) -> PlacedImage | None:
                 values[name] = str(values[name])
             for name in ("seconds", "shared_error", "feature_seconds", "probability"):
                 values[name] = float(values[name])
-            found = PlacedImage(**values)
+            found = StoredImage(**values)
             if found.model:
                 found.camera  # noqa: B018 - refuses a calibration that is none
     except UNREADABLE:

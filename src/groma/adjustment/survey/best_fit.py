@@ -48,17 +48,17 @@ _TERMS = (
 )  # fmt: skip
 
 
-def settled(scene: Scene) -> Scene:
+def best_fitted(scene: Scene) -> Scene:
     """Return a scene that measurements of other instruments place where these fit best; what was measured stays.
 
     The scale is kept, too, if depths or stereo pairs determine it; scenes with held objects are left unchanged.
     """
-    similarity = placement(scene)
+    similarity = best_fit(scene)
     return scene if similarity is None else moved_to(scene, similarity)
 
 
-def placement(scene: Scene) -> Similarity | None:
-    """Return the motion that :func:`settled` moves a scene by; None where it stays."""
+def best_fit(scene: Scene) -> Similarity | None:
+    """Return the motion that :func:`best_fitted` moves a scene by; None where it stays."""
     if not (scene.has_survey or len(scene.pose_priors)) or len(scene.held) or not scene.num_images:
         return None
     return _best(scene)
@@ -71,7 +71,7 @@ def moved_to(scene: Scene, similarity: Similarity) -> Scene:
 
 def _best(scene: Scene) -> Similarity:
     """Return the similarity to where a scene fits best."""
-    light = _with_places(accepted(scene).keep(points=[], line_observations=[]).replace(keypoints=Keypoints()))
+    light = _with_positions(accepted(scene).keep(points=[], line_observations=[]).replace(keypoints=Keypoints()))
     centers = light.cam_centers_in_world
     middle, total = centers.mean(axis=0), Similarity()
     length = float(np.median(np.linalg.norm(centers - middle, axis=1))) or 1.0
@@ -97,12 +97,12 @@ def _similarity(step: FloatArray, center: FloatArray, length: float) -> Similari
     return Similarity(scale, rotation, center + length * step[:3] - scale * rotation @ center)
 
 
-def _with_places(scene: Scene) -> Scene:
+def _with_positions(scene: Scene) -> Scene:
     """Return the scene with control points in place of lines and planes that are measured at a place on them.
 
     With the whole scene these places move as points do; on a line that moves alone they stay at the foot of an anchor.
     """
-    scene = scene.replace(distances=measured_at_places(scene))
+    scene = scene.replace(distances=measured_at_positions(scene))
     places, tables = [scene.control_points.xyz], {}
     for name, kinds, column in (("distances", "first_kind", "first_idx"), ("known_planes", "kind", "idx")):
         table = getattr(scene, name)
@@ -118,7 +118,7 @@ def _with_places(scene: Scene) -> Scene:
     return scene.replace(control_points=points, **tables)
 
 
-def measured_at_places(scene: Scene) -> Distances:
+def measured_at_positions(scene: Scene) -> Distances:
     """Return the distances, the shortest between two lines as measured where the first is nearest to the second now."""
     table, lines = scene.distances, scene.lines.plucker
     if not (rows := np.flatnonzero(table.is_shortest)).size:
