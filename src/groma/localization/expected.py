@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._numba import loop
+from groma._rows import distinct
 from groma._typing import FloatArray, IntArray
 from groma.localization.landmarks import counted_in
 from groma.localization.map_index import MapIndex
@@ -119,7 +120,7 @@ def shown_of(
     expected = [(pixel, rate, VERDICT.expected)]
     if lines and scene.num_lines:
         rows = np.concatenate([np.arange(int(index.segment_begin[i]), int(index.segment_begin[i + 1])) for i in near])
-        known = np.unique(scene.line_observations.line_idx[index.segment[rows]])
+        known = distinct(scene.line_observations.line_idx[index.segment[rows]], scene.num_lines)[0]
         expected.append((*_lengths(camera, best.pose, scene.lines.segments[known]), 0.5 * side))
     parts = _counted(camera, expected, shown, VERDICT.parts)
     alike, itself = (np.isin(point, some) for some in found)

@@ -69,10 +69,10 @@ def _sum(descriptor, owner, total):
 @unrolled_loop
 def _unit(descriptor, out):
     for n in range(descriptor.shape[0]):
-        square = np.int32(0)
+        square = 0.0
         for j in range(descriptor.shape[1]):
-            square += np.int32(descriptor[n, j]) * np.int32(descriptor[n, j])
-        factor = 1.0 / max(np.float64(np.float32(np.sqrt(np.float64(square)))), 1e-6)
+            square += np.float64(descriptor[n, j]) ** 2
+        factor = 1.0 / max(np.float64(np.float32(np.sqrt(square))), 1e-6)
         for j in range(descriptor.shape[1]):
             out[n, j] = np.float32(factor * np.float64(descriptor[n, j]))
 
