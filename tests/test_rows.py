@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from groma._rows import Rows, pointers_of
+from groma._rows import Rows, distinct, pointers_of
 from groma.tracking.frame.measurements import LineMeasurements, PlaneMeasurements, PointMeasurements
 from groma.tracking.map.lines import FollowedSegments
 
@@ -39,6 +39,13 @@ def test_every_table_of_measurements_can_be_empty():
         [(0,), (0, 4), (0,), (0, 2), (0, 2)],
         [(0,), (0, 4), (0, 3, 3)],
     ]
+
+
+def test_different_numbers_are_those_of_unique():
+    numbers = np.random.default_rng(0).integers(0, 40, 30)
+    for some in (numbers, numbers[:0]):
+        for found, expected in zip(distinct(some, 40), np.unique(some, return_inverse=True), strict=True):
+            np.testing.assert_array_equal(found, expected)
 
 
 def test_pointers_of_groups_are_whole_numbers_also_without_groups():

@@ -24,6 +24,15 @@ def pointers_of(count: npt.ArrayLike) -> npt.NDArray[np.int64]:
     return np.concatenate([[0], np.cumsum(count, dtype=np.int64)])
 
 
+def distinct(numbers: IntArray, count: int) -> tuple[IntArray, IntArray]:
+    """Return the different ones of some of the numbers from 0 to ``count``, in order, and for each its place among
+    them: what ``np.unique`` does by sorting.
+    """
+    among = np.zeros(count, bool)
+    among[numbers] = True
+    return np.flatnonzero(among), (np.cumsum(among) - 1)[numbers]
+
+
 def connected_parts(first: IntArray, second: IntArray, count: int) -> IntArray:
     """Return the connected component (count,) of each node of a graph, numbered by their first nodes.
 

@@ -18,7 +18,7 @@ from groma.features.contract import ImageRetrieval
 from groma.geometry import quaternion, so3
 from groma.io import read_scene, write_scene
 from groma.localization.features import find_corners, find_points, mirrored, unit
-from groma.localization.localizer import LocalizeOptions, Localizer
+from groma.localization.localizer import LocalizeOptions, Localizer, check_photographs
 from groma.localization.map_index import read_index
 from groma.localization.matching import match_descriptors
 from groma.localization.pose.camera import QueryCamera
@@ -293,6 +293,24 @@ def test_maps_and_images_that_do_not_fit_are_refused(place, tmp_path):
     camera = QueryCamera("PINHOLE", np.array([500.0, 500.0, 160.0, 120.0]), 320, 240)
     with pytest.raises(InputError, match="pixels"):
         Localizer(place / "map.npz", place / "images").localize(place / "queries" / QUERIES[0], camera)
+
+
+def test_photographs_of_several_sequences_are_where_the_summary_says(place, tmp_path):
+    scene, sources = read_scene(place / "map.npz").subset([0, 1]), []
+    write_scene(scene, tmp_path / "map")
+    with pytest.raises(InputError, match="is unknown"):
+        check_photographs(tmp_path / "map")
+    for number, name in enumerate(scene.images.names):  # one name in both sequences
+        (tmp_path / f"{number}" / "rgb").mkdir(parents=True)
+        shutil.copy(place / "images" / name, tmp_path / f"{number}" / "rgb" / "frame.jpg")
+        sources.append({"path": str(tmp_path / f"{number}"), "images": {name: "frame.jpg"}})
+    (tmp_path / "map" / "summary.json").write_text(json.dumps({"sources": sources}))
+    check_photographs(tmp_path / "map")
+    files = [tmp_path / f"{number}" / "rgb" / "frame.jpg" for number in range(2)]
+    assert Localizer(tmp_path / "map").files == files
+    (tmp_path / "1" / "rgb" / "frame.jpg").unlink()
+    with pytest.raises(InputError, match="are not in"):
+        Localizer(tmp_path / "map")
 
 
 def test_command(place, localizer, tmp_path, capsys):

@@ -12,6 +12,7 @@ from groma.localization.landmarks import GATES, DescribedLandmarks, coarsest, co
 from groma.localization.line_matching import SeenLines, lines_near
 from groma.localization.map_index import MapIndex
 from groma.localization.matching import MATCHES, alike_elsewhere, lengths_of, match_descriptors, pairs_near
+from groma.localization.pose.matches import nearest_claims
 
 pytestmark = pytest.mark.kernels
 
@@ -19,6 +20,20 @@ pytestmark = pytest.mark.kernels
 def _vectors(rng, count, size=32):
     values = rng.normal(size=(count, size)).astype(np.float32)
     return values / np.linalg.norm(values, axis=1, keepdims=True)
+
+
+def test_vectors_are_descriptors_over_their_lengths():
+    descriptors = np.random.default_rng(4).integers(0, 256, (300, 128), dtype=np.uint8)
+    descriptors[0] = 0
+    lengths = np.maximum(np.linalg.norm(descriptors.astype(np.float32), axis=1, keepdims=True), np.float32(1e-6))
+    np.testing.assert_array_equal(unit(descriptors), descriptors / lengths)
+
+
+def test_of_equal_claims_the_first_of_the_nearest_stays():
+    claim, distance = np.array([2, 0, 2, 0, 2, 5]), np.array([1.0, 3.0, 1.0, 2.0, 0.5, np.inf])
+    agrees = np.array([True, True, True, True, False, False])
+    assert nearest_claims(claim, distance, agrees).tolist() == [True, False, False, True, False, False]
+    assert not len(nearest_claims(claim[:0], distance[:0], agrees[:0]))
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(300, 5000), (1100, 300), (70, 30), (1, 50)])
@@ -43,6 +58,7 @@ def test_points_near_where_they_are_expected():
     rng = np.random.default_rng(2)
     places, pixels = rng.uniform(-10, 210, (200, 2)), rng.uniform(0, 200, (300, 2))
     pixels[:100] = places[:100] + rng.normal(0, 3, (100, 2))
+    places[196:] = [[-1e4, 100], [1e4, 100], [100, -1e4], [1e4, 1e4]]  # far beyond any pixel
     first, second = (rng.integers(0, 256, (count, 128), dtype=np.uint8) for count in (200, 300))
     second[:100] = first[:100]
     shuffled = rng.permutation(200)  # rows of the descriptors that places have

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from groma._rows import numbered
+from groma._rows import distinct, numbered
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import together
 from groma.features.matching.wide_baseline import match_wide_baseline
@@ -164,8 +164,8 @@ def _lines_near(
     rows = np.concatenate([np.arange(int(index.segment_begin[i]), int(index.segment_begin[i + 1])) for i in images])
     line = scene.line_observations.line_idx[index.segment[rows]]
     determined = np.isfinite(index.line_covariance[line, 0, 0])
-    known, owner = np.unique(line[determined], return_inverse=True)
-    seen = SeenLines(owner.ravel(), index.segment_descriptor[rows[determined]], scene.lines.segments[known])
+    known, owner = distinct(line[determined], len(scene.lines))
+    seen = SeenLines(owner, index.segment_descriptor[rows[determined]], scene.lines.segments[known])
     pairs = lines_near(camera, pose, seen, query.segments, query.segment_descriptors, reach)
     return np.column_stack([pairs[:, 1], known[pairs[:, 0]]])
 

@@ -17,6 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from groma._numba import loop
+from groma._rows import distinct
 from groma._typing import FloatArray, IntArray
 from groma.localization.landmarks import counted_in
 from groma.localization.map_index import MapIndex
@@ -34,6 +36,18 @@ _ASKED = 40
 _PIECES = VERDICT.parts
 
 
+# ---------------------------------------------------------------------------------------------------------- Kernels
+@loop
+def _place(pixel, width, height, scale, parts, out):
+    """The part that each pixel lies in, row by row; -1 outside the image."""
+    for i in range(pixel.shape[0]):
+        u, v = pixel[i, 0], pixel[i, 1]
+        out[i] = -1
+        if 0.0 <= u <= width and 0.0 <= v <= height:
+            out[i] = min(int(v * scale), parts - 1) * parts + min(int(u * scale), parts - 1)
+
+
+# ----------------------------------------------------------------------------------------------------------- Public
 @dataclass(frozen=True, eq=False)
 class FoundAgain:
     """How often points of a map are found again, learned from its own images."""
@@ -97,7 +111,7 @@ def shown_of(
     """
     camera, side = best.camera, max(best.camera.width, best.camera.height) / VERDICT.parts
     ends = matches.segments2d[best.line_inliers]
-    shown = np.concatenate([matches.points2d[best.point_inliers], _along(ends, _PIECES)[0]])
+    shown = np.concatenate([matches.points2d[best.point_inliers], _middles(_borders(ends)).reshape(-1, 2)])
     point, times = _seen_by(index, near)
     pixel = camera.project(best.pose, index.xyz[point])
     inside = camera.inside(pixel)
@@ -106,7 +120,7 @@ def shown_of(
     expected = [(pixel, rate, VERDICT.expected)]
     if lines and scene.num_lines:
         rows = np.concatenate([np.arange(int(index.segment_begin[i]), int(index.segment_begin[i + 1])) for i in near])
-        known = np.unique(scene.line_observations.line_idx[index.segment[rows]])
+        known = distinct(scene.line_observations.line_idx[index.segment[rows]], scene.num_lines)[0]
         expected.append((*_lengths(camera, best.pose, scene.lines.segments[known]), 0.5 * side))
     parts = _counted(camera, expected, shown, VERDICT.parts)
     alike, itself = (np.isin(point, some) for some in found)
@@ -125,12 +139,13 @@ def _counted(
     every = parts * parts
     weight, counts = np.zeros(every), np.zeros(every, bool)
     for pixel, amount, least in expected:
-        inside = camera.inside(pixel)
-        total = np.bincount(_part(pixel[inside], camera, parts), amount[inside], every)
+        part = _part(pixel, camera, parts)
+        total = np.bincount(part[part >= 0], amount[part >= 0], every)
         weight += total / max(float(total.sum()), 1e-12)
         counts |= total >= least
     seen = np.zeros(every, bool)
-    seen[_part(shown[camera.inside(shown)], camera, parts)] = True
+    part = _part(shown, camera, parts)
+    seen[part[part >= 0]] = True
     if not counts.any():
         return 0.0, 0.0
     missing = float(weight[counts & ~seen].sum() / weight[counts].sum() * counts.sum())
@@ -138,9 +153,11 @@ def _counted(
 
 
 def _part(pixel: FloatArray, camera: QueryCamera, parts: int) -> IntArray:
-    """The part of an image that each pixel lies in, of so many per longer side."""
-    column, row = np.minimum(pixel * (parts / max(camera.width, camera.height)), parts - 1).astype(np.int64).T
-    return row * parts + column
+    """The part of an image that each pixel lies in, of so many per longer side; -1 outside."""
+    part = np.empty(len(pixel), np.int64)
+    scale = parts / max(camera.width, camera.height)
+    _place(np.ascontiguousarray(pixel), camera.width, camera.height, scale, parts, part)
+    return part
 
 
 def _seen_by(index: MapIndex, images: IntArray) -> tuple[IntArray, IntArray]:
@@ -154,17 +171,19 @@ def _seen_by(index: MapIndex, images: IntArray) -> tuple[IntArray, IntArray]:
     return point, times[point]
 
 
-def _along(ends: FloatArray, pieces: int) -> tuple[FloatArray, FloatArray]:
-    """Middles (n * pieces, k) of the pieces of segments (n, 2, k), and their borders (n, pieces + 1, k)."""
-    share = np.linspace(0.0, 1.0, pieces + 1)[None, :, None]
-    borders = ends[:, :1] + share * (ends[:, 1:] - ends[:, :1])
-    return (0.5 * (borders[:, 1:] + borders[:, :-1])).reshape(-1, ends.shape[-1]), borders
+def _borders(ends: FloatArray) -> FloatArray:
+    """Where the pieces of segments (n, 2, k) begin and end, (n, pieces + 1, k)."""
+    share = np.linspace(0.0, 1.0, _PIECES + 1)[None, :, None]
+    return ends[:, :1] + share * (ends[:, 1:] - ends[:, :1])
+
+
+def _middles(borders: FloatArray) -> FloatArray:
+    return 0.5 * (borders[:, 1:] + borders[:, :-1])
 
 
 def _lengths(camera: QueryCamera, pose: FloatArray, ends: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Middles (n, 2) of the images of pieces of 3D segments, and the lengths (n,) of these images."""
-    borders = _along(ends, _PIECES)[1]
+    borders = _borders(ends)
     pixel = camera.project(pose, borders.reshape(-1, 3)).reshape(*borders.shape[:2], 2)
     length = np.linalg.norm(pixel[:, 1:] - pixel[:, :-1], axis=2).ravel()
-    middle = (0.5 * (pixel[:, 1:] + pixel[:, :-1])).reshape(-1, 2)
-    return middle, np.nan_to_num(length)
+    return _middles(pixel).reshape(-1, 2), np.nan_to_num(length)

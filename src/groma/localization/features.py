@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from groma._numba import loop
+from groma._numba import unrolled_loop
 from groma._rows import Rows, column
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import together
@@ -55,7 +55,7 @@ FEATURES = FeatureGates()
 
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
-@loop
+@unrolled_loop
 def _sum(descriptor, owner, total):
     for n in range(len(owner)):
         square = np.float32(0.0)
@@ -64,6 +64,17 @@ def _sum(descriptor, owner, total):
         factor = np.float32(1.0) / np.sqrt(max(square, np.float32(1e-6)))
         for j in range(descriptor.shape[1]):
             total[owner[n], j] += factor * descriptor[n, j]
+
+
+@unrolled_loop
+def _unit(descriptor, out):
+    for n in range(descriptor.shape[0]):
+        square = 0.0
+        for j in range(descriptor.shape[1]):
+            square += np.float64(descriptor[n, j]) ** 2
+        factor = 1.0 / max(np.float64(np.float32(np.sqrt(square))), 1e-6)
+        for j in range(descriptor.shape[1]):
+            out[n, j] = np.float32(factor * np.float64(descriptor[n, j]))
 
 
 # ----------------------------------------------------------------------------------------------------------- Public
@@ -136,8 +147,9 @@ def mirrored(points: DescribedPoints, width: int) -> DescribedPoints:
 
 def unit(descriptors: Bytes) -> npt.NDArray[np.float32]:
     """Descriptors (n, 128) as vectors of length one."""
-    values = descriptors.astype(np.float32)
-    return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), np.float32(1e-6))
+    vectors = np.empty(descriptors.shape, np.float32)
+    _unit(descriptors, vectors)
+    return vectors
 
 
 def summed(descriptors: Bytes, owner: IntArray, count: int) -> npt.NDArray[np.float32]:

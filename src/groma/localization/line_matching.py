@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from groma._numba import loop
+from groma._numba import loop, unrolled_loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.features.matching.descriptor import Descriptors
 from groma.features.matching.wide_baseline import WideBaselineOptions
@@ -60,7 +60,7 @@ def _near(lines, segments, order, middle, beyond, reach, angle, overlap, rows, c
     return count
 
 
-@loop
+@unrolled_loop
 def _most_alike(rows, columns, begin, of_lines, of_segments, out):
     """Largest product of a descriptor of a line with that of a segment, for each pair."""
     for n in range(rows.shape[0]):
@@ -71,6 +71,28 @@ def _most_alike(rows, columns, begin, of_lines, of_segments, out):
                 product += of_lines[k, j] * of_segments[columns[n], j]
             best = max(best, product)
         out[n] = best
+
+
+@loop
+def _project(ends, R_t, K, out, visible):
+    """Images of segments (L, 2, 3), cut before the camera, and which are in front of it."""
+    P = np.empty((2, 3))
+    for n in range(ends.shape[0]):
+        for i in range(2):
+            for j in range(3):
+                P[i, j] = R_t[j, 3]
+                for k in range(3):
+                    P[i, j] += R_t[j, k] * ends[n, i, k]
+        least = 1e-3 * max(abs(P[0, 2]), abs(P[1, 2]))
+        visible[n] = P[0, 2] >= least or P[1, 2] >= least
+        for i in range(2):
+            share, depth = 0.0, P[i, 2]
+            if depth < least and visible[n]:
+                share = min(max((least - depth) / (P[1 - i, 2] - depth), 0.0), 1.0)
+            z = depth + share * (P[1 - i, 2] - depth)
+            for j in range(2):
+                place = (P[i, j] + share * (P[1 - i, j] - P[i, j])) / z
+                out[n, i, j] = (place if visible[n] else 1.0) * K[j, j] + K[j, 2]
 
 
 # ----------------------------------------------------------------------------------------------------------- Public
@@ -139,15 +161,6 @@ def _pairs_near(lines: FloatArray, segments: FloatArray, reach: float) -> tuple[
 
 def _projected(camera: QueryCamera, pose: FloatArray, ends: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Images (L, 2, 2) of 3D segments without distortion, cut before the camera; and which are in front of it."""
-    R_t = se3.to_matrix(pose[None])[0]
-    inside = ends @ R_t[:3, :3].T + R_t[:3, 3]
-    depth = inside[..., 2]
-    least = 1e-3 * np.abs(depth).max(axis=1)
-    behind = depth < least[:, None]
-    step = np.where(depth == depth[:, ::-1], 1.0, depth[:, ::-1] - depth)
-    share = np.clip((least[:, None] - depth) / step, 0.0, 1.0)
-    cut = np.where(behind[..., None], inside + share[..., None] * (inside[:, ::-1] - inside), inside)
-    visible = ~behind.all(axis=1)
-    cut[~visible] = 1.0
-    K = camera.matrix
-    return cut[..., :2] / cut[..., 2:] * K[[0, 1], [0, 1]] + K[:2, 2], visible
+    projected, visible = np.empty((len(ends), 2, 2)), np.empty(len(ends), bool)
+    _project(np.ascontiguousarray(ends), se3.to_matrix(pose[None])[0], camera.matrix, projected, visible)
+    return projected, visible

@@ -30,7 +30,13 @@ from groma.localization.candidates import (
 from groma.localization.expected import FoundAgain, nearest_images, shown_of
 from groma.localization.features import MIN_LENGTH, DescribedImage, DescribedPoints, find_features
 from groma.localization.landmarks import DescribedLandmarks, coarsest, seen_in
-from groma.localization.map_images import OPTIONS, estimated_in_summary, image_paths, images_in_summary
+from groma.localization.map_images import (
+    OPTIONS,
+    estimated_in_summary,
+    files_in_summary,
+    image_paths,
+    images_in_summary,
+)
 from groma.localization.map_index import images_told, kept_index
 from groma.localization.pose.absolute_pose import (
     UNKNOWN_LENS,
@@ -133,7 +139,7 @@ class Localizer:
             index = index_file(Path(map_))
         path = None if index is None else Path(index)
         #: Files of the images of the map, in their order.
-        self.files = image_paths(self.scene, _folder(map_, images, path))
+        self.files = _files(self.scene, map_, images, path)
         #: The descriptions; and what could not be done as wanted, in words.
         estimated = self.options.estimated
         if estimated is None:
@@ -315,6 +321,15 @@ class Localizer:
         return np.argsort(-self._retrieval.similarity(described, self.index.image), kind="stable")[:wanted]  # type: ignore[arg-type]
 
 
+def _files(scene: Scene, map_: object, images: str | os.PathLike[str] | None, index: Path | None) -> list[Path]:
+    """Files of the images of a map: from a folder as given, else from several or one that the map tells."""
+    names = scene.images.names
+    told = {} if images is not None or isinstance(map_, Scene) else files_in_summary(Path(str(map_)))
+    if told.keys() >= set(names):
+        return [told[name] for name in names]
+    return image_paths(names, _folder(map_, images, index))
+
+
 def _folder(map_: object, images: str | os.PathLike[str] | None, index: Path | None) -> Path:
     """Folder of the photographs of a map: as given, else as the description or the summary of the map tells."""
     if images is not None:
@@ -328,10 +343,14 @@ def _folder(map_: object, images: str | os.PathLike[str] | None, index: Path | N
     return told
 
 
-def photographs_of(map_: str | os.PathLike[str], images: str | os.PathLike[str] | None = None) -> Path:
-    """Return the folder of the photographs of a map: as given, or as it tells; InputError where it does not."""
+def check_photographs(map_: str | os.PathLike[str], images: str | os.PathLike[str] | None = None) -> None:
+    """Check that the photographs of a map are in a folder as given, or that the map tells where they are; InputError
+    where it does not.
+    """
+    if images is not None or files_in_summary(Path(map_)):
+        return
     try:
-        return _folder(map_, images, index_file(Path(map_)))
+        _folder(map_, None, index_file(Path(map_)))
     except InputError:
         read_scene(map_)  # what is no map at all tells nothing of photographs, either
         raise

@@ -4,19 +4,19 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 
 from groma.bounded.documents import read_document
 from groma.bounded.names import IMAGES, stays_inside
 from groma.errors import GromaError, InputError
-from groma.scene import Scene
 
 #: How the folder of a map's photographs is passed.
 OPTIONS = "--images; to groma merge --images-a and --images-b, to groma map --extend --map-images"
 
 
-def image_paths(scene: Scene, folder: Path) -> list[Path]:
-    """Return the files of the images of a map: by name in a folder, else by the last part of the name below it.
+def image_paths(names: Sequence[str], folder: Path) -> list[Path]:
+    """Return the files of images of a map: by name in a folder, else by the last part of the name below it.
 
     Raises
     ------
@@ -25,7 +25,6 @@ def image_paths(scene: Scene, folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder. Pass the photographs of the map: {OPTIONS}.")
-    names = scene.images.names
     found = [folder / name if stays_inside(name) else Path() for name in names]
     missing = [row for row, path in enumerate(found) if not path.is_file()]
     below: defaultdict[str, list[Path]] = defaultdict(list)
@@ -50,6 +49,20 @@ def images_in_summary(map_: Path) -> Path | None:
         return Path(told) if isinstance(told, str) and Path(told).is_dir() else None
     except (OSError, ValueError, AttributeError, GromaError):
         return None
+
+
+def files_in_summary(map_: Path) -> dict[str, Path]:
+    """Return the files of the images of a map by name, where its summary tells the sequences that they are from: more
+    than one, where it was tracked in the map of another. Empty where it does not, or where a file is missing.
+    """
+    found: dict[str, Path] = {}
+    try:
+        for source in read_document(map_ / "summary.json")["sources"]:
+            names, frames = list(source["images"]), list(source["images"].values())
+            found |= zip(names, image_paths(frames, Path(source["path"])), strict=True)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, GromaError):
+        return {}
+    return found
 
 
 def estimated_in_summary(map_: Path) -> tuple[bool, bool]:

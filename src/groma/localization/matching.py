@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._numba import loop, unrolled_loop
-from groma._rows import pointers_of
+from groma._rows import distinct, pointers_of
 from groma._typing import FloatArray, IntArray
 from groma.execution import map_ranges
 from groma.gates import gate
@@ -114,8 +114,8 @@ def match_descriptors(first: Vectors, second: Vectors) -> IntArray:
         return np.zeros((0, 2), np.int64)
     best, far, farther = _nearest_two(first, second)
     rows = np.flatnonzero((far <= MATCHES.distance) & (far <= MATCHES.ratio * farther))
-    columns, which = np.unique(best[rows], return_inverse=True)
-    mutual = _nearest_two(second[columns], first)[0][which.ravel()] == rows
+    columns, which = distinct(best[rows], len(second))
+    mutual = _nearest_two(second[columns], first)[0][which] == rows
     return np.column_stack([rows[mutual], best[rows[mutual]]])
 
 

@@ -70,10 +70,10 @@ def merge_maps(
 ) -> MergedModel:
     """Estimate the transformation between two maps and return their joint model. ``following`` are the later stages."""
     from groma.localization.joining.merging import merged_model
-    from groma.localization.localizer import photographs_of
+    from groma.localization.localizer import check_photographs
 
     for one, where in zip(maps, images, strict=True):
-        photographs_of(one, where)  # before minutes are spent on the other
+        check_photographs(one, where)  # before minutes are spent on the other
     folder = photograph_folder(output, force)
     warnings: list[str] = []
 

@@ -27,7 +27,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from groma._numba import loop
+from groma._numba import unrolled_loop
 from groma._rows import pointers_of
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import assemble
@@ -54,7 +54,7 @@ GATES = CommonErrorGates()
 
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
-@loop
+@unrolled_loop
 def _pull_views(begin, seen, motion, landmarks, by_landmark, first_camera, K):
     """Add to K what landmarks (n,) do that pull (n, d, m) at a query, view by view of the map."""
     parameters, size = motion.shape[2] - 6, motion.shape[1]
