@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A wrong focal length of a stereo pair: the images contradict it where the camera turns, and only there."""
+"""A wrong focal length of a stereo pair or a single camera: the images contradict it where the camera turns."""
 
 from dataclasses import replace
 
@@ -10,11 +10,14 @@ import pytest
 from groma.tracking import Tracker, TrackOptions
 
 
-@pytest.mark.parametrize(("factor", "turn", "told"), [(1.0, 0.06, False), (1.15, 0.06, True), (1.15, 0.0, False)])
-def test_a_wrong_focal_length_is_told_where_the_camera_turns(factor, turn, told):
-    pair = _room.camera(_room.BASELINE)
-    given = replace(pair, params=pair.params * np.array([factor, factor, 1.0, 1.0]))
+@pytest.mark.parametrize(("factor", "turns", "told"), [(1.0, True, False), (1.15, True, True), (1.15, False, False)])
+@pytest.mark.parametrize(
+    ("kind", "count", "turn", "step"), [("stereo", 16, 0.06, 0.04), ("mono", 30, 0.03, 0.06)], ids=["stereo", "mono"]
+)
+def test_a_wrong_focal_length_is_told_where_the_camera_turns(kind, count, turn, step, factor, turns, told):
+    camera = _room.camera(_room.BASELINE if kind == "stereo" else None)
+    given = replace(camera, params=camera.params * np.array([factor, factor, 1.0, 1.0]))
     tracker = Tracker(given, TrackOptions(threaded=False))
-    for frame in _room.frames("stereo", _room.poses(16, turn=turn, step=0.04)):
+    for frame in _room.frames(kind, _room.poses(count, turn=turn * turns, step=step)):
         tracker.process(frame)
     assert any("focal length" in warning for warning in tracker.finish().warnings) == told

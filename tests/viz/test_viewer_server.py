@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Who may connect to the viewer: its own page, under a name of this machine; a real server and real sockets."""
 
+import contextlib
 import http.client
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from groma.viz.viewer.server import Doorkeeper, start_server, stop_server
+from groma.viz.viewer.server import Doorkeeper, keep_cameras, start_server, stop_server
 
 
 @pytest.fixture(scope="module")
@@ -88,3 +91,22 @@ def test_only_a_few_refusals_are_said():
     for number in range(100):
         keeper.note(f"{number // 2}")
     assert said == ["0", "1", "2", "3", "4"]
+
+
+def test_a_page_that_comes_back_keeps_its_camera():
+    on, begun = {}, []
+    server = SimpleNamespace(
+        on_client_connect=lambda call: on.update(connect=call), on_client_disconnect=lambda call: on.update(leave=call)
+    )
+    keep_cameras(server, begun.append)
+
+    def page(position, look_at):
+        camera = SimpleNamespace(position=np.array(position), look_at=np.array(look_at), up_direction=np.eye(3)[2])
+        return SimpleNamespace(camera=camera, atomic=contextlib.nullcontext)
+
+    on["leave"](page([1.0, 2.0, 3.0], [0.0, 0.5, 0.0]))
+    back, new = page([1.0, 2.0, 3.0], [0.0, 0.0, 0.0]), page([-5.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    on["connect"](back)
+    on["connect"](new)
+    assert begun == [new]
+    np.testing.assert_array_equal(back.camera.look_at, [0.0, 0.5, 0.0])

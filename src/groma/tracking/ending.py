@@ -130,16 +130,16 @@ class Ending:
             "the adjustment of all keyframes", lambda: mapper.adjust_at_end(number), (None, turn), changes=(number,)
         )
         told, gates = [] if mapper.depth_offset is None else mapper.depth_offset.warnings(), mapper.options.gates
-        if mapper.camera.baseline > 0:
-            told = self.attempt(
-                "whether the focal length fits",
-                lambda: focal_length_that_does_not_fit(mapper.map, mapper.camera, gates.rectification), [], changes=(),
-            )  # fmt: skip
-        elif not mapper.metric:
+        if not mapper.metric:
             told = self.attempt(
                 "whether another motion fits",
                 lambda: motion_that_does_not_fit(mapper.map, mapper.camera, gates, mapper.options.point_sigma_px),
                 [], changes=(),
+            )  # fmt: skip
+        if mapper.camera.baseline > 0 or not (told or mapper.metric):
+            told = self.attempt(
+                "whether the focal length fits",
+                lambda: focal_length_that_does_not_fit(mapper.map, mapper.camera, gates.rectification), [], changes=(),
             )  # fmt: skip
         elif not told and mapper.map.living():
             told = self.attempt(

@@ -29,7 +29,7 @@ from groma.viz.colours import of_lines
 from groma.viz.pack import thin
 from groma.viz.viewer import arrays as _view_arrays
 from groma.viz.viewer.glance import Picture, Statuses, read_now, read_statuses, timeline
-from groma.viz.viewer.server import Say, start_server, stop_server
+from groma.viz.viewer.server import Say, keep_cameras, start_server, stop_server
 
 if TYPE_CHECKING:
     import viser
@@ -75,6 +75,7 @@ class LiveView:
         server.gui.main_panel.dock_right()
         # The world is the first camera, whose y points down.
         server.scene.set_up_direction("-y")
+        keep_cameras(server)
         self.statuses: Statuses | None = None
         self._path = np.zeros((0, 7))
         self._words = server.gui.add_markdown("")

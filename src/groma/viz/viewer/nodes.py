@@ -18,6 +18,7 @@ from groma.viz.pictures import ImageFiles, image_file, read_picture, warn_of_nam
 from groma.viz.viewer import arrays as _view_arrays
 from groma.viz.viewer import messages as _view_words
 from groma.viz.viewer.content import LINE_MODES, REACH, ViewContent
+from groma.viz.viewer.server import keep_cameras
 
 if TYPE_CHECKING:
     import viser
@@ -86,7 +87,7 @@ class SceneView:
             self.draw_points()
             self.draw_lines()
         server.scene.on_click()(self._clicked)
-        server.on_client_connect(self._look_from_outside)
+        keep_cameras(server, self._look_from_outside)
 
     # ------------------------------------------------------------------------------------------------------- Panel
 

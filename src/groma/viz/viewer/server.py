@@ -18,6 +18,8 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
+import numpy as np
+
 from groma.errors import GromaError
 
 if TYPE_CHECKING:
@@ -145,3 +147,23 @@ def _checked(doorkeeper: Doorkeeper) -> Iterator[list[bool]]:
             yield applied
         finally:
             sockets.serve = serve
+
+
+def keep_cameras(server: viser.ViserServer, begin: Callable[[Any], None] = lambda client: None) -> None:
+    """Give a page whose connection was cut the camera that it had; ``begin`` is called for other pages."""
+    left: list[Any] = []
+
+    def remember(client: Any) -> None:
+        left.append((client.camera.position, client.camera.look_at, client.camera.up_direction))
+
+    def connected(client: Any) -> None:
+        camera = client.camera
+        for position, look_at, up in left:
+            if np.allclose(camera.position, position):
+                with client.atomic():
+                    camera.up_direction, camera.position, camera.look_at = up, position, look_at
+                return
+        begin(client)
+
+    server.on_client_disconnect(remember)
+    server.on_client_connect(connected)
