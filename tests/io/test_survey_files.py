@@ -49,6 +49,56 @@ def test_positions_in_the_usual_layouts(tmp_path, text, sigma):
     np.testing.assert_array_equal(found.sigma, np.full((2, 3), np.nan) if sigma is None else sigma)
 
 
+@pytest.mark.parametrize(
+    ("text", "sigma"),
+    [
+        ("#Rev: senseFly\nfileName\tlatitude\tlongitude\taltitude_amsl\taltitude_wgs84\na.jpg\t2\t1\t3\t40\n", ()),
+        ("imagename,latitude [dd],longitude [dd],altitude [meter],accuracy horizontal [m],accuracy vertical [m]\n"
+         "a.jpg,2,1,3,.1,.2\n", (0.1, 0.1, 0.2)),
+        ("imagename,latitude,longitude,altitude,omega,Accuracy Easting [m],Accuracy Northing [m],Accuracy Vert [m]\n"
+         "a.jpg,2,1,3,9,.1,.2,.3\n", (0.1, 0.2, 0.3)),
+        ("SourceFile,GPSLatitude,GPSLongitude,GPSAltitude\na.jpg,2,1,3\n", ()),
+        ("#Label,Longitude,Latitude,Altitude,Accuracy_X/Y_(m),Accuracy_Z_(m)\na.jpg,1,2,3,.1,.2\n", (0.1, 0.1, 0.2)),
+        ("#CoordinateSystem: WGS 84 (EPSG::4326)\n#Label,X/Longitude,Y/Latitude,Z/Altitude,Yaw,Accuracy_X_(m),"
+         "Accuracy_Y_(m),Accuracy_Z_(m)\na.jpg,1,2,3,90,.1,.2,.3\n", (0.1, 0.2, 0.3)),
+        ("#System: WGS 84 (EPSG::4326)\n#Label,X/Longitude,Y/Latitude,Z/Altitude,Accuracy_(m)\na.jpg,1,2,3,,\n", ()),
+    ],
+)  # fmt: skip
+def test_degrees_in_the_layouts_of_other_programs(tmp_path, text, sigma):
+    """Of senseFly, Pix4D, ExifTool and Metashape; a field that is left empty states nothing."""
+    found = read_positions(written(tmp_path, "positions.csv", text))
+    assert found.names == ("a.jpg",) and found.system.is_geographic and found.coordinates.tolist() == [[1, 2, 3]]
+    np.testing.assert_array_equal(found.sigma, [sigma or [np.nan] * 3])
+
+
+def test_hemispheres_and_well_known_text(tmp_path):
+    text = "name,GPSLatitude,GPSLatitudeRef,GPSLongitude,GPSLongitudeRef,z\na.jpg,2,South,1,W,3\nb.jpg,2,N,-1,W,3\n"
+    found = read_positions(written(tmp_path, "exiftool.csv", text))
+    assert found.coordinates.tolist() == [[-1, -2, 3], [-1, 2, 3]]
+    unit, code = 'UNIT["metre",1,AUTHORITY["EPSG","9001"]]', 'AUTHORITY["EPSG","32632"]'
+    rows = "#Label X/Easting Y/Northing Z/Altitude Omega Phi Kappa\na.jpg 593656.5 5089108.8 909.4 69.8 -11.2 -4.5\n"
+    found = read_positions(written(tmp_path, "wkt.txt", f'# CoordinateSystem: PROJCS["UTM",{unit},{code}]\n{rows}'))
+    assert found.system.name == "EPSG:32632" and np.isnan(found.sigma).all()
+    assert found.coordinates.tolist() == [[593656.5, 5089108.8, 909.4]]
+    assert read_positions(written(tmp_path, "own.txt", f'# LOCAL_CS["own",{unit}]\n{rows}')).system.is_local
+
+
+def test_a_header_in_a_comment_tells_angles_from_standard_deviations(tmp_path):
+    text = "#name,x,y,alt,heading,pitch,roll\na.jpg,1,2,3,90,5,7\n"
+    found = read_positions(written(tmp_path, "reality.csv", text))
+    assert found.coordinates.tolist() == [[1, 2, 3]] and np.isnan(found.sigma).all() and found.system.is_local
+
+
+def test_numbers_that_look_like_degrees_need_their_name(tmp_path):
+    rows = "a.jpg,37.5448,139.0398,216.6\nb.jpg,37.5449,139.0399,216.9\n"
+    for text in (rows, "name,x,y,z\n" + rows):
+        with pytest.raises(FileFormatError, match=r"heights by 0\.3: they look like degrees\. Name the columns"):
+            read_positions(written(tmp_path, "positions.csv", text))
+    assert read_positions(written(tmp_path, "positions.csv", "local\n" + rows)).system.is_local
+    for text in ("a 1 2 3\nb 1.01 2.01 3.001\n", "a 1 2 3\nb 1.5 2.5 9\n", "a 99 98 3\nb 99.1 98.1 9\n", "a 1 2 3\n"):
+        assert read_positions(written(tmp_path, "positions.csv", text)).system.is_local
+
+
 def test_geo_txt_of_opendronemap(tmp_path):
     text = "EPSG:32617\na.jpg 500000.5 4e6 100 1 2 3 0.03 0.05\nb.jpg 500010 4000010 101\nc.jpg 500020 4000020\n"
     found = read_positions(written(tmp_path, "geo.txt", text))

@@ -24,6 +24,7 @@ from groma.mapping.posed.axes import check_axes
 from groma.mapping.posed.motions import motions_of
 from groma.mapping.posed.noise import noise_of_given
 from groma.mapping.posed.register import averaged
+from groma.mapping.posed.sentences import about_contradiction
 from groma.scene import Cameras, Scene
 
 FOCAL, COUNT = 800.0, 14
@@ -121,6 +122,18 @@ def test_poses_that_claim_much_do_not_outvote_motions(world):
     assert np.degrees(np.linalg.norm(quaternion.log(between), axis=1)).max() < 0.5
     centers = average_centers(given.cam_centers_in_world, turned.values, motions, np.arange(COUNT) != 5)
     assert np.linalg.norm(centers.values - scene.cam_centers_in_world, axis=1).max() < 0.1
+
+
+def test_matches_of_sides_that_look_alike_contradict_poses_and_are_told(world):
+    """Four groups of images, each of another side of a box, match as if all had seen one side."""
+    scene, motions = world
+    rotation, side = scene.cam_from_world[:, :4], np.arange(COUNT) % 4
+    seen = quaternion.multiply(rotation, quaternion.exp(np.outer(0.5 * np.pi * side, [0.0, 0.0, 1.0])))
+    between = quaternion.multiply(seen[motions.second], quaternion.conjugate(seen[motions.first]))
+    known = averaged(scene, replace(motions, rotation=between))[1]
+    assert "contradict each other" in " ".join(about_contradiction(known.turn.sigma))
+    noisy = disturbed(scene, 0.2, 5.0, [], 0)
+    assert not about_contradiction(averaged(noisy, motions)[1].turn.sigma) and not about_contradiction(None)
 
 
 @pytest.mark.parametrize("seed", range(4))

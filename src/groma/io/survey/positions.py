@@ -5,13 +5,14 @@
 no header            ``name x y z``, and one or three standard deviations
 header               the columns by name: ``name`` (``image``, ``filename``, ``label``); ``x y z`` (``easting``,
                      ``northing``, ``height``), or ``longitude latitude altitude``; ``sigma`` (``accuracy``),
-                     or ``sx sy sz``, or ``horizontal vertical``
+                     or ``sx sy sz``, or ``horizontal vertical``; others are not read. Metashape, RealityCapture
+                     and others write it as the last comment before the first image, the system in one above
 first line a system  ``EPSG:32611``, ``WGS84 UTM 11N`` or ``+proj=...``: what follows is in that system. This is
                      ``geo.txt`` of OpenDroneMap: ``name x y z omega phi kappa horizontal vertical``; all after z
                      may be missing
 ===================  ================================================================================================
 
-Of longitude and latitude, x is the longitude.
+Of longitude and latitude, x is the longitude. Numbers of an unnamed system that look like these are refused.
 """
 
 from __future__ import annotations
@@ -24,29 +25,47 @@ from pathlib import Path
 import numpy as np
 
 from groma._counted import counted
-from groma.bounded.text import finite, read_lines, shown
+from groma.bounded.text import finite, read_lines, read_text, shown
 from groma.errors import FileFormatError
 from groma.io.reading import existing, reading
 from groma.io.survey.coordinates import CoordinateSystem, Places
 
 _KIND = "file of positions"
-#: Names of columns, in lower case and without what stands in brackets or after an underscore and a unit.
+#: How much smaller than their distance from the origin places are apart that look like degrees (convention: a tenth).
+FAR = 0.1
+#: Names of columns: the letters of what is left by :data:`_UNITS` and :data:`_QUALIFIERS`.
 _COLUMNS = {
     "name": ("name", "image", "imagename", "filename", "file", "label", "photo"),
     "x": ("x", "easting", "east", "e", "geox"),
     "y": ("y", "northing", "north", "n", "geoy"),
-    "z": ("z", "height", "altitude", "alt", "elevation", "up", "h", "geoz", "altitudem"),
+    "z": ("z", "height", "altitude", "alt", "elevation", "elev", "up", "h", "geoz"),
     "longitude": ("longitude", "lon", "long", "lng"),
     "latitude": ("latitude", "lat"),
+    "east": ("longituderef",),
+    "north": ("latituderef",),
     "sigma": ("sigma", "accuracy", "std", "stddev", "sd"),
-    "sx": ("sx", "sigmax", "stdx", "se", "xaccuracy", "sdx"),
-    "sy": ("sy", "sigmay", "stdy", "sn", "yaccuracy", "sdy"),
-    "sz": ("sz", "sigmaz", "stdz", "su", "zaccuracy", "sdz"),
-    "horizontal": ("horizontal", "horizontalaccuracy", "horzaccuracy", "sh", "hacc"),
-    "vertical": ("vertical", "verticalaccuracy", "vertaccuracy", "sv", "vacc"),
+    "sx": ("sx", "sigmax", "stdx", "se", "xaccuracy", "accuracyx", "accuracyeasting", "sdx"),
+    "sy": ("sy", "sigmay", "stdy", "sn", "yaccuracy", "accuracyy", "accuracynorthing", "sdy"),
+    "sz": ("sz", "sigmaz", "stdz", "su", "zaccuracy", "accuracyz", "sdz"),
+    "horizontal": (
+        "horizontal",
+        "horizontalaccuracy",
+        "accuracyhorizontal",
+        "horzaccuracy",
+        "accuracyhorz",
+        "sh",
+        "hacc",
+    ),
+    "vertical": ("vertical", "verticalaccuracy", "accuracyvertical", "vertaccuracy", "accuracyvert", "sv", "vacc"),
 }
+#: What names of columns add: another name after a stroke, brackets and units; and qualifiers, as of GPSLatitude and
+#: altitude_amsl. Heights above sea level and the ellipsoid differ by a constant at one place.
+_UNITS = re.compile(r"[(\[/].*|[_ ](m|meters?|metres?|deg|degrees|dd)$")
+_QUALIFIERS = re.compile(r"^(gps|utm|source|ellipsoidal)(?=.)|(?<=.)(amsl|msl|wgs|ellipsoidal)$")
 #: Two numbers of which each has a comma, apart by something else.
 _DECIMAL_COMMAS = re.compile(r"\d,\d+\s*[;\s]\s*-?\d+,\d")
+#: A code of a coordinate system in a comment; of those in well-known text the last is that of the whole.
+_CODE = re.compile(r"EPSG(?:::?\s?|\",\s?\")(\d{3,6})")
 _MEANING = {word: meaning for meaning, words in _COLUMNS.items() for word in words}
 
 
@@ -66,10 +85,34 @@ def read_positions(path: str | os.PathLike[str]) -> Places:
         system = CoordinateSystem.parse(next(line for _, line in read_lines(place)))
         if system is not None:
             return _places(place, rows[1:], ["name", "x", "y", "z"], system, _after_z)
+        above = read_text(place).splitlines()[: rows[0][0] - 1]
+        codes = [] if any("LOCAL_CS[" in line for line in above) else _CODE.findall(" ".join(above))
+        system = CoordinateSystem(f"EPSG:{codes[-1]}" if codes else "")
+        comments = (_words(line.strip().lstrip("#")) for line in reversed(above) if line.strip())
+        if _header(rows[0][1]) is None and (words := next(comments, None)) and _header(words) is not None:
+            rows.insert(0, (0, words))
         columns = _header(rows[0][1])
         if columns is None:
-            return _places(place, rows, ["name", "x", "y", "z"], CoordinateSystem(), _plain)
-        return _with_header(place, rows, columns)
+            return _not_degrees(_places(place, rows, ["name", "x", "y", "z"], system, _plain))
+        return _not_degrees(_with_header(place, rows, columns, system))
+
+
+def _not_degrees(places: Places) -> Places:
+    """Return places of an unnamed system, unless they are far from its origin, and farther apart in height than else.
+
+    So are degrees: those of a flight differ by a thousandth, heights by metres. Of lengths that is an odd choice of an
+    origin, which can be confirmed.
+    """
+    first, second, height = np.ptp(places.coordinates, axis=0) if len(places.names) > 1 else np.zeros(3)
+    least, most = np.sort(np.abs(places.coordinates[:, :2]).max(axis=0))
+    is_near = max(first, second) < FAR * np.abs(places.coordinates[:, :2]).min()
+    if places.system.is_local and least <= 90.0 and most <= 180.0 and is_near and height > max(first, second) > 0.0:
+        raise FileFormatError(
+            f"{places.source}: the first two coordinates differ by {first:.2g} and {second:.2g}, heights by "
+            f"{height:.2g}: they look like degrees. Name the columns in a first line, such as "
+            "name,latitude,longitude,altitude; or, if they are lengths, write 'local' there."
+        )
+    return places
 
 
 def split(line: str) -> list[str]:
@@ -82,6 +125,10 @@ def split(line: str) -> list[str]:
     """
     if _DECIMAL_COMMAS.search(line):
         raise FileFormatError(f"{shown(line)} has decimal commas. Write points, as in 1.25.")
+    return _words(line)
+
+
+def _words(line: str) -> list[str]:
     mark = next((mark for mark in ";\t," if mark in line), None)
     words = [word.strip().strip('"') for word in line.split(mark)]
     while words and not words[-1]:
@@ -93,13 +140,16 @@ def _header(words: Sequence[str]) -> dict[str, int] | None:
     """Return the column of each meaning; None if the line holds no names of columns."""
     found: dict[str, int] = {}
     for column, word in enumerate(words):
-        bare = re.sub(r"[^a-z]", "", re.sub(r"[(\[].*", "", word.lower()))
+        plain = _UNITS.sub("", word.strip().lower().replace("x/y", "horizontal"))
+        bare = _QUALIFIERS.sub("", re.sub(r"[^a-z]", "", plain))
         if bare in _MEANING and not re.search(r"\.(jpe?g|png|tiff?|dng)$", word.lower()):
             found.setdefault(_MEANING[bare], column)
     return found if len(found) >= 3 else None
 
 
-def _with_header(place: Path, rows: Sequence[tuple[int, list[str]]], columns: dict[str, int]) -> Places:
+def _with_header(
+    place: Path, rows: Sequence[tuple[int, list[str]]], columns: dict[str, int], system: CoordinateSystem
+) -> Places:
     geographic = {"longitude", "latitude"} <= columns.keys()
     needed = ("name", *(("longitude", "latitude") if geographic else ("x", "y")), "z")
     if missing := [name for name in needed if name not in columns]:
@@ -108,19 +158,23 @@ def _with_header(place: Path, rows: Sequence[tuple[int, list[str]]], columns: di
             "name, x, y, z or name, longitude, latitude, altitude."
         )
     order = [columns[name] for name in needed]
-    if {"sx", "sy", "sz"} <= columns.keys():
-        sigma = [columns[name] for name in ("sx", "sy", "sz")]
-    elif {"horizontal", "vertical"} <= columns.keys():
-        sigma = [columns["horizontal"], columns["horizontal"], columns["vertical"]]
-    else:
-        sigma = [columns["sigma"]] * 3 if "sigma" in columns else []
-    last = max((*order, *sigma))
+    one = columns.get("sigma")
+    across, up = columns.get("horizontal", one), columns.get("vertical", columns.get("sz", one))
+    sigma = [columns.get("sx", across), columns.get("sy", across), columns.get("sz", up)]
+    stated = [column for column in sigma if column is not None] if None not in sigma else []
+    last = max(order)
     ordered = []
     for number, words in rows[1:]:
         if len(words) <= last:
             raise FileFormatError(f"{place}, line {number}: expected {last + 1} columns; got {len(words)}.")
-        ordered.append((number, [words[column] for column in (*order, *sigma)]))
-    system = CoordinateSystem("EPSG:4326" if geographic else "")
+        values = [words[column] for column in order]
+        for row, side in ((1, "east"), (2, "north")) if geographic else ():
+            if side in columns and "".join(words[columns[side] :][:1]).upper().startswith(("S", "W")):
+                values[row] = f"-{values[row].lstrip('-')}"
+        accuracy = ["".join(words[column:][:1]) or "0" for column in stated]  # left empty: not stated
+        ordered.append((number, values + accuracy))
+    if geographic:
+        system = CoordinateSystem("EPSG:4326")
     return _places(place, ordered, list(needed), system, _plain)
 
 

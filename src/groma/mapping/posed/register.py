@@ -33,7 +33,7 @@ from groma.mapping.posed.axes import check_axes
 from groma.mapping.posed.motions import Motions, motions_of
 from groma.mapping.posed.noise import GivenNoise, noise_of_given
 from groma.mapping.posed.registered import RegisteredPhotographs
-from groma.mapping.posed.sentences import about_gross_errors, about_left_out, about_noise
+from groma.mapping.posed.sentences import about_contradiction, about_gross_errors, about_left_out, about_noise
 from groma.scene import PosePriors, Scene, Similarity
 from groma.scene.local_frame import usual_frame
 from groma.scene.table import new_index_of
@@ -155,6 +155,7 @@ def _told(found: Scene, known: GivenPoses | None, near: Similarity | None) -> Re
         unit = 1.0 if near is None else 1.0 / near.scale
         notes = about_noise(known.place.sigma, known.turn.sigma, unit, int((seen & ~known.gross).sum()))
         warnings = about_gross_errors(names, known.gross & seen, found, known.poses, unit) + warnings
+        warnings = about_contradiction(known.turn.sigma) + warnings
         found = found.replace(pose_priors=known.priors())
     found = found.subset(np.flatnonzero(seen), min_observations=2)
     return RegisteredPhotographs(

@@ -11,6 +11,7 @@ from groma._counted import first_of
 from groma._typing import BoolArray, FloatArray
 from groma.evaluation.alignment import camera_centers
 from groma.geometry import quaternion
+from groma.mapping.posed.axes import GATES as AXES
 from groma.scene import Scene
 
 #: Names in a sentence (convention: a sentence holds no more).
@@ -24,6 +25,17 @@ def about_noise(place: float | None, turn: float | None, unit: float, count: int
     parts = [] if place is None else [f"{place * unit:.2g} units of length in each coordinate"]
     parts += [] if turn is None else [f"{np.degrees(turn):.2g} degrees about each axis"]
     return [f"Noise of the {count} given poses that were used, as the photographs show it: {' and '.join(parts)}."]
+
+
+def about_contradiction(turn: float | None) -> list[str]:
+    """Say that given poses and matches contradict each other, where orientations are off by what is no noise."""
+    if turn is None or turn < AXES.cut:
+        return []
+    return [
+        "The given poses and the matches contradict each other: orientations differ by "
+        f"{np.degrees(turn):.2g} degrees, and the matches were followed. Objects that look alike from several sides "
+        "give such matches: --fix-poses keeps the given poses. Else check that names and poses belong together."
+    ]
 
 
 def about_gross_errors(
