@@ -82,11 +82,13 @@ _ARRAY = re.compile(
     r"~?(?:numpy\.)?ndarray\[tuple\[~?(?:typing\.)?Any, (?:\.\.\.|…)\], ~?(?:numpy\.)?dtype\[~?(?:numpy\.)?(\w+)\]\]"
 )
 _DEFERRED = re.compile(r"~?(?:[\w.]+\.)?TypeAliasForwardRef\('(\w+)'\)")
+_LIKE = re.compile(r"~?[\w.]*_Buffer \| .*?_NestedSequence\[complex \| bytes \| str\]")
 _SHORT = {"float64": "FloatArray", "integer": "IntArray", "bool": "BoolArray", "bool_": "BoolArray"}
 _PIPES = re.compile(r"(`[^`]*`)|(?<!\\)\|([^|\s][^|]*?)\|")
 
 
 def _short(text: str) -> str:
+    text = _LIKE.sub("ArrayLike", text)
     text = _ARRAY.sub(lambda match: _SHORT.get(match[1], f"NDArray[{match[1]}]"), text)
     return _DEFERRED.sub(lambda match: match[1], text)
 

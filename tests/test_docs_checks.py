@@ -12,6 +12,7 @@ import sys
 from functools import cache
 from pathlib import Path
 
+import numpy.typing as npt
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -63,6 +64,8 @@ def test_array_types_have_short_names_in_the_reference(monkeypatch):
     deferred = "~numpy.ndarray[tuple[~typing.Any, ...], ~numpy.dtype[~numpy.float64]]"
     assert short(f"(image: {pixels} | None) -> {deferred}") == "(image: NDArray[uint8] | None) -> FloatArray"
     assert short("list[TypeAliasForwardRef('IntArray')]") == "list[IntArray]"
+    written = pytest.importorskip("sphinx.util.typing").stringify_annotation
+    assert short(f"{written(npt.ArrayLike, 'smart')} | None") == "ArrayLike | None"
     assert short("dict[str, float]") == "dict[str, float]"
 
 

@@ -342,7 +342,9 @@ def test_command(place, localizer, tmp_path, capsys):
     assert set(right) <= set(model.images.names)
     image = list(model.images.names).index(right[0])
     assert model.cam_centers_in_world[image] == pytest.approx(told[right[0]]["center"], abs=1e-6)
-    assert f'<td class="words">{told["black.png"]["sentence"]}' in (out / "report.html").read_text()
+    page = (out / "report.html").read_text()
+    assert f'<td class="words">{told["black.png"]["sentence"]}' in page
+    assert f"<td>{told[right[0]]['rotation_sigma_deg']:.2g}°</td>" in page
     assert not out.with_name("out.work").exists()
 
 

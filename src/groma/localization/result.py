@@ -20,6 +20,9 @@ from groma.localization.stored import StoredImage
 from groma.scene import Scene
 from groma.viz.report.page import PageContents, write_report
 
+#: Head of the table of photographs, on the screen and on the page.
+COLUMNS = ("photograph", "status", "points", "lines", "centre known to", "rotation")
+
 
 @dataclass(frozen=True, eq=False)
 class LocalizeResult:
@@ -95,19 +98,29 @@ class LocalizeResult:
         return name if name in known else name.removeprefix("query/")
 
 
+def row_of(one: StoredImage) -> tuple[str, ...]:
+    """Return a row of the table with the head :data:`COLUMNS`."""
+    numbers = one.to_dict()
+    sigma, turn = numbers["center_sigma"], numbers["rotation_sigma_deg"]
+    center = "" if sigma is None else f"{sum(value * value for value in sigma) ** 0.5:.2g}"
+    seen = (f"{numbers['num_point_inliers']:,}", f"{numbers['num_line_inliers']:,}")
+    return one.name, one.status, *seen, center, "" if turn is None else f"{turn:.2g}°"
+
+
 def _table(queries: Sequence[StoredImage]) -> str:
     """The queries as a card of the page."""
-    rows = "".join(
-        f'<tr><td class="name">{html.escape(one.name)}</td><td>{one.status}</td>'
-        f"<td>{len(one.point):,}</td><td>{len(one.line):,}</td>"
-        f'<td class="words">{html.escape(one.sentence)}</td></tr>'
-        for one in queries
-    )
+    rows = []
+    for one in queries:
+        name, *cells = row_of(one)
+        told = "".join(f"<td>{cell}</td>" for cell in cells)
+        words = html.escape(one.sentence)
+        rows.append(f'<tr><td class="name">{html.escape(name)}</td>{told}<td class="words">{words}</td></tr>')
     count = sum(one.status == "localized" for one in queries)
+    head = "".join(f"<th>{name}</th>" for name in COLUMNS)
     return (
-        '<section class="card wide"><h2>Queries</h2><p class="caption">'
+        '<section class="card wide"><h2>Photographs</h2><p class="caption">'
         f"{count} of {counted(len(queries), 'photographs')} localised. "
-        "The images show what of the map was found in each.</p>"
-        "<table><thead><tr><th>photograph</th><th>status</th><th>points</th><th>lines</th><th></th></tr></thead>"
-        f"<tbody>{rows}</tbody></table></section>"
+        "The images show what of the map was found in each. Standard deviations: of the centre, in units of the map, "
+        f"and of the rotation.</p><table><thead><tr>{head}<th></th></tr></thead>"
+        f"<tbody>{''.join(rows)}</tbody></table></section>"
     )

@@ -117,25 +117,16 @@ def localize(
 
 def _say(console: Console, result: "LocalizeResult") -> None:
     """Print a table with at most a dozen of the localised photographs, the reasons of the others, and the counts."""
+    from groma.localization.result import COLUMNS, row_of
+
     found = result.queries
     localized = [one for one in found if one.status == "localized"]
     hidden = 0 if console.verbose else max(len(localized) - _SHOWN, 0)
     left_out = {one.name for one in localized[len(localized) - hidden :]}
-    console.table(
-        ("photograph", "status", "points", "lines", "centre known to", "rotation"),
-        [_row(one) for one in found if one.name not in left_out],
-    )
+    console.table(COLUMNS, [row_of(one) for one in found if one.name not in left_out])
     if hidden:
         console.say(f"  and {hidden:,} more that are localised; --verbose shows them.")
     for one in found:
         (console.detail if one.status == "localized" else console.say)(f"{one.name}: {one.sentence}")
     numbers = ", ".join(f"{result.count(status)} {status}" for status in ("localized", "uncertain", "failed"))
     console.say(f"{counted(len(found), 'photographs')}: {numbers}.")
-
-
-def _row(one: "StoredImage") -> tuple[str, ...]:
-    numbers = one.to_dict()
-    sigma, turn = numbers["center_sigma"], numbers["rotation_sigma_deg"]
-    center = "" if sigma is None else f"{sum(value * value for value in sigma) ** 0.5:.2g}"
-    seen = (f"{numbers['num_point_inliers']:,}", f"{numbers['num_line_inliers']:,}")
-    return one.name, one.status, *seen, center, "" if turn is None else f"{turn:.2g}°"
