@@ -14,7 +14,7 @@ from groma.tracking import Tracker, TrackOptions
 def test_a_wrong_focal_length_is_told_where_the_camera_turns(factor, turn, told):
     pair = _room.camera(_room.BASELINE)
     given = replace(pair, params=pair.params * np.array([factor, factor, 1.0, 1.0]))
-    tracker = Tracker(given, TrackOptions(threaded=False))
+    tracker = Tracker(given, TrackOptions(num_points=250, num_features=500, lines=False, threaded=False))
     for frame in _room.frames("stereo", _room.poses(16, turn=turn, step=0.04)):
         tracker.process(frame)
     assert any("focal length" in warning for warning in tracker.finish().warnings) == told

@@ -75,7 +75,7 @@ def _error(tracker: Tracker) -> float:
 
 def test_maps_of_one_camera_are_joined_with_their_scale(ring):
     """The camera is covered for half a second and more; the second map sees where the first began."""
-    tracker = Tracker(_room.camera(), TrackOptions())
+    tracker = Tracker(_room.camera(), TrackOptions(num_points=250, num_features=500))
     rows = [tracker.process(frame) for k, frame in enumerate(ring) if not 60 <= k < 85]
     assert {row.submap for row in rows} == {0, 1}
     result = tracker.finish()

@@ -18,6 +18,7 @@ pytestmark = pytest.mark.shared
 
 
 SECOND = pytest.param(2, marks=pytest.mark.slow)  # the third is harder
+WHOLE = pytest.param(None, marks=pytest.mark.slow)
 
 
 @pytest.mark.parametrize("stride", [pytest.param(3, marks=pytest.mark.slow), 5])
@@ -94,16 +95,18 @@ def _assert_photographs(scene, folder):
     assert np.bincount(seen[:, 1], minlength=scene.num_points).min() >= 2
 
 
-def test_a_flight_in_uneven_steps(shared_data):
+@pytest.mark.parametrize("count", [15, pytest.param(30, marks=pytest.mark.slow)])
+def test_a_flight_in_uneven_steps(shared_data, count):
     """Pairs 0.05 to 7.3 s apart: steps of up to 1.2 m and 59 degrees, past a radiator whose bars repeat."""
-    statuses, result, scores = _track(shared_data / "stereo_euroc_v101_keyframes", max_frames=30)
+    statuses, result, scores = _track(shared_data / "stereo_euroc_v101_keyframes", max_frames=count)
     assert set(statuses) == {"tracked"}
     assert result.submaps == ()
     assert scores.ate.rmse < 0.03
 
 
-def test_street_by_a_stereo_pair(shared_data):
-    statuses, result, scores = _track(shared_data / "stereo_kitti06")
+@pytest.mark.parametrize("count", [20, WHOLE])
+def test_street_by_a_stereo_pair(shared_data, count):
+    statuses, result, scores = _track(shared_data / "stereo_kitti06", max_frames=count)
     assert set(statuses) == {"tracked"}
     assert scores.drift_percent is not None
     assert scores.drift_percent < 1.0
@@ -162,9 +165,10 @@ def test_a_board_by_one_camera(shared_data):
     np.testing.assert_allclose(distance, np.abs(world_from_cam[:, 6]), atol=0.01)
 
 
-def test_the_kitchen_turned_about_the_camera(shared_data):
+@pytest.mark.parametrize("count", [24, pytest.param(60, marks=pytest.mark.slow)])
+def test_the_kitchen_turned_about_the_camera(shared_data, count):
     """A smaller camera at the same places swings by up to 12 degrees from frame to frame."""
-    sequence = open_sequence(shared_data / "rgbd_7scenes_redkitchen", max_frames=60)
+    sequence = open_sequence(shared_data / "rgbd_7scenes_redkitchen", max_frames=count)
     old = sequence.camera
     size = int(0.62 * old.width), int(0.62 * old.height)
     camera = SequenceCamera("PINHOLE", np.array([*old.params[:2], size[0] / 2, size[1] / 2]), *size)
