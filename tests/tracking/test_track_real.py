@@ -105,7 +105,7 @@ def test_a_flight_in_uneven_steps(shared_data, count):
     assert scores.ate.rmse < 0.03
 
 
-@pytest.mark.parametrize("count", [14, pytest.param(None, marks=SLOW)])
+@pytest.mark.parametrize("count", [20, pytest.param(None, marks=SLOW)])
 def test_street_by_a_stereo_pair(shared_data, count):
     statuses, result, scores = _track(shared_data / "stereo_kitti06", max_frames=count)
     assert set(statuses) == {"tracked"}
@@ -146,12 +146,11 @@ def test_street_by_one_camera(shared_data):
     assert slope < 2.0
 
 
-@pytest.mark.parametrize("stride", [pytest.param(3, marks=SLOW), 6])
-def test_a_board_by_one_camera(shared_data, stride):
+def test_a_board_by_one_camera(shared_data):
     """The board is the plane z = 0 of the reference, up to a similarity."""
     folder = shared_data / "mono_checkerboard_desk"
-    _, result, scores = _track(folder, "sim3", stride=stride)
-    scene, reference = result.scene, open_sequence(folder, stride=stride).reference
+    _, result, scores = _track(folder, "sim3", stride=3)
+    scene, reference = result.scene, open_sequence(folder, stride=3).reference
     assert reference is not None
     assert scores.ate.rmse < 0.005
     counts = np.bincount(scene.relations.point_on_plane[:, 1], minlength=scene.num_planes)
