@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import pytest
-from _facade import facade
 
 from groma.errors import InputError
 from groma.features import ExternalMatches, LsdDetector, Segments
@@ -32,12 +31,6 @@ class Blind:
     def detect(self, image):
         type(self).images = getattr(type(self), "images", 0) + 1
         return Segments.empty()
-
-
-@pytest.fixture(scope="module")
-def corner(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("corner") / "images"
-    return folder, facade(folder, 4)
 
 
 def test_names_become_parts_with_the_settings_of_the_map():

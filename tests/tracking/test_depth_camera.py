@@ -25,7 +25,7 @@ def frames():
 
 def _tracked(frames, offset):
     """A finished track of frames whose inverse depths are too small by an offset."""
-    tracker = Tracker(_room.camera(), TrackOptions(keyframe_motion=0.05))
+    tracker = Tracker(_room.camera(), TrackOptions(keyframe_motion=0.05, lines=False))
     for frame in frames:
         depth = np.where(frame.depth > 0, 1.0 / (1.0 / np.maximum(frame.depth, 1e-6) - offset), 0.0)
         tracker.process(replace(frame, depth=depth.astype(np.float32)))

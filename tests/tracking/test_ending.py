@@ -27,7 +27,7 @@ from groma.tracking.map.landmarks import ALIVE
 from groma.tracking.map.track_map import Keyframe, TrackMap
 
 COUNT = 18
-OPTIONS = TrackOptions(num_points=250, num_features=500)
+OPTIONS = TrackOptions(num_points=250, num_features=500, lines=False)
 
 
 def _map(shift: float, count: int = 6) -> TrackMap:

@@ -269,7 +269,8 @@ def test_a_track_with_a_turned_right_camera():
     """Of 0.1, 0.2 and -0.15 degrees: the track begins anew as soon as motion tells yaw, and keeps what it found."""
     turn, truth = np.radians([0.1, 0.2, -0.15]), _room.poses(36)
     frames = _turned_frames(turn, truth)
-    tracker, better, count = Tracker(_room.camera(_room.BASELINE)), None, 0
+    options = TrackOptions(num_points=250, num_features=500, lines=False)
+    tracker, better, count = Tracker(_room.camera(_room.BASELINE), options), None, 0
     while better is None and count < 30:
         assert tracker.process(frames[count]).status == "tracked"
         better, count = tracker.begun_anew(), count + 1

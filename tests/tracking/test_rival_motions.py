@@ -10,7 +10,7 @@ from groma.tracking import Tracker, TrackOptions
 from groma.tracking.backend.rival_motions import motion_that_does_not_fit
 from groma.tracking.map.track_map import TrackMap
 
-OPTIONS = TrackOptions(threaded=False, keyframe_motion=0.06, keyframe_turn=0.1)
+OPTIONS = TrackOptions(threaded=False, lines=False, keyframe_motion=0.06, keyframe_turn=0.1)
 
 
 @pytest.fixture(scope="module")

@@ -17,17 +17,17 @@ from groma.tracking import Tracker, TrackOptions
 pytestmark = pytest.mark.shared
 
 
-SECOND = pytest.param(2, marks=pytest.mark.slow)  # the third is harder
+SLOW = pytest.mark.slow
 
 
-@pytest.mark.parametrize("stride", [pytest.param(3, marks=pytest.mark.slow), 5])
+@pytest.mark.parametrize("stride", [pytest.param(3, marks=SLOW), 5])
 def test_kitchen_with_frames_left_out(shared_data, stride):
     statuses, _, scores = _track(shared_data / "rgbd_7scenes_redkitchen", stride=stride)
     assert set(statuses) == {"tracked"}
     assert scores.ate.rmse < 0.02
 
 
-@pytest.mark.parametrize("stride", [SECOND, 3])
+@pytest.mark.parametrize("stride", [pytest.param(2, marks=SLOW), 3])  # the third is harder
 def test_cabinet_with_frames_left_out(shared_data, stride):
     """Up to 30 degrees from frame to frame, with few points."""
     statuses, result, scores = _track(shared_data / "rgbd_tum_fr3_cabinet", stride=stride)
@@ -46,11 +46,13 @@ def test_a_cabinet_seen_again_from_the_opposite_side_is_not_found(shared_data):
 
 
 @pytest.mark.parametrize("kind", ["stereo", "mono"])
-@pytest.mark.parametrize("stride", [SECOND, 3])
-def test_street_with_frames_left_out(shared_data, kind, stride):
+@pytest.mark.parametrize(
+    ("stride", "count"), [pytest.param(2, None, marks=SLOW), pytest.param(3, None, marks=SLOW), (3, 8)]
+)
+def test_street_with_frames_left_out(shared_data, kind, stride, count):
     """Up to 3.6 metres from frame to frame; one per cent of drift is allowed for each step of the full sequence."""
     align = "sim3" if kind == "mono" else "se3"
-    statuses, _, scores = _track(shared_data / "stereo_kitti06", align, kind=kind, stride=stride)
+    statuses, _, scores = _track(shared_data / "stereo_kitti06", align, kind=kind, stride=stride, max_frames=count)
     assert "lost" not in statuses
     assert scores.drift_percent is not None
     assert scores.drift_percent < stride
@@ -65,7 +67,7 @@ def _track(folder, align: Alignment = "se3", options=None, **selection):
     return statuses, result, score_trajectory(result.trajectory, frames.reference, align, max_time_difference=0.02)
 
 
-@pytest.mark.slow
+@SLOW
 def test_kitchen(shared_data):
     statuses, result, scores = _track(shared_data / "rgbd_7scenes_redkitchen")
     assert set(statuses) == {"tracked"}
@@ -73,7 +75,7 @@ def test_kitchen(shared_data):
     assert result.scene.num_lines > 30
 
 
-@pytest.mark.slow
+@SLOW
 def test_cabinet_needs_lines_and_planes(shared_data):
     """Few points, wide steps: 3 cm over a path of 8.3 m with all landmarks; points alone are farther off."""
     statuses, result, scores = _track(shared_data / "rgbd_tum_fr3_cabinet")
@@ -94,16 +96,18 @@ def _assert_photographs(scene, folder):
     assert np.bincount(seen[:, 1], minlength=scene.num_points).min() >= 2
 
 
-def test_a_flight_in_uneven_steps(shared_data):
+@pytest.mark.parametrize("count", [10, pytest.param(30, marks=SLOW)])
+def test_a_flight_in_uneven_steps(shared_data, count):
     """Pairs 0.05 to 7.3 s apart: steps of up to 1.2 m and 59 degrees, past a radiator whose bars repeat."""
-    statuses, result, scores = _track(shared_data / "stereo_euroc_v101_keyframes", max_frames=30)
+    statuses, result, scores = _track(shared_data / "stereo_euroc_v101_keyframes", max_frames=count)
     assert set(statuses) == {"tracked"}
     assert result.submaps == ()
     assert scores.ate.rmse < 0.03
 
 
-def test_street_by_a_stereo_pair(shared_data):
-    statuses, result, scores = _track(shared_data / "stereo_kitti06")
+@pytest.mark.parametrize("count", [20, pytest.param(None, marks=SLOW)])
+def test_street_by_a_stereo_pair(shared_data, count):
+    statuses, result, scores = _track(shared_data / "stereo_kitti06", max_frames=count)
     assert set(statuses) == {"tracked"}
     assert scores.drift_percent is not None
     assert scores.drift_percent < 1.0
@@ -131,7 +135,7 @@ def _ground_below(scene):
     return float(np.median(height)), float(upright)
 
 
-@pytest.mark.slow
+@SLOW
 def test_street_by_one_camera(shared_data):
     statuses, result, scores = _track(shared_data / "stereo_kitti06", "sim3", kind="mono")
     assert "lost" not in statuses

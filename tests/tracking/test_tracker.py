@@ -83,9 +83,13 @@ def test_kinds_of_landmarks_apart(rgbd, truth, options):
     assert _room.position_error(result.trajectory, truth) < 0.02
 
 
-def test_stereo_pair(truth):
-    frames = _room.frames("stereo", truth[:16])
-    rows, result = _run(frames, _room.camera(_room.BASELINE))
+@pytest.fixture(scope="module")
+def stereo(truth):
+    return _run(_room.frames("stereo", truth[:16]), _room.camera(_room.BASELINE))
+
+
+def test_stereo_pair(stereo, truth):
+    rows, result = stereo
     assert all(row.status == "tracked" for row in rows)
     # A disparity of half a pixel at 2.5 units is 4 cm; hundreds of points bring that below 2 cm.
     assert _room.position_error(result.trajectory, truth) < 0.02
@@ -117,8 +121,8 @@ def test_adjusting_a_tracked_scene_is_the_same_problem(tracked):
     assert len(groma.adjust(bare).report.num_measurements) == 0
 
 
-def test_adjusting_a_tracked_stereo_scene_is_the_same_problem(truth):
-    _, result = _run(_room.frames("stereo", truth[:16]), _room.camera(_room.BASELINE))
+def test_adjusting_a_tracked_stereo_scene_is_the_same_problem(stereo):
+    _, result = stereo
     assert "right columns" in result.scene.num_measurements
     report, moved = _adjusted_again(result)
     assert report.solve.initial_cost < 1.02 * report.solve.final_cost
@@ -141,10 +145,10 @@ def test_runs_repeat_exactly(rgbd, tracked):
 
 def test_looking_at_a_running_track_changes_nothing(rgbd, tracked):
     tracker = Tracker(_room.camera(), TrackOptions(num_points=250, num_features=500))
-    for frame in rgbd:
+    for number, frame in enumerate(rgbd):
         tracker.process(frame)
         assert len(tracker.trajectory()) <= len(rgbd)
-        assert tracker.scene().num_images <= len(rgbd)
+        assert number % 3 or tracker.scene().num_images <= len(rgbd)
     np.testing.assert_array_equal(tracker.finish().trajectory.world_from_cam, tracked[1].trajectory.world_from_cam)
 
 
@@ -259,7 +263,7 @@ def _to_the_opposite_wall() -> tuple[np.ndarray, np.ndarray]:
     there = np.array(
         [_turned(1.5 * k, 0.02 * k) for k in range(10)] + [_turned(180, 0.1 + 0.01 * k) for k in range(24)]
     )
-    back = np.array([_turned(180 - 4 * k, 0.3) for k in range(1, 44)] + [_turned(4 - 0.5 * k, 0.3) for k in range(8)])
+    back = np.array([_turned(180 - 6 * k, 0.3) for k in range(1, 30)] + [_turned(4 - 0.5 * k, 0.3) for k in range(8)])
     return there, back
 
 
