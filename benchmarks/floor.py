@@ -32,12 +32,12 @@ os.environ.setdefault("NUMBA_CACHE_DIR", str(CACHE / "numba"))
 
 import numpy as np  # noqa: E402
 
+from groma import _stopwatch  # noqa: E402
 from groma.adjustment.assemble import assemble  # noqa: E402
 from groma.adjustment.assembly_options import AssemblyOptions  # noqa: E402
 from groma.io import read_scene  # noqa: E402
 from groma.problem.lay_out import lay_out  # noqa: E402
 from groma.problem.layout import Layout  # noqa: E402
-from groma.solver import report as solver_report  # noqa: E402
 from groma.solver.options import SolverOptions  # noqa: E402
 from groma.solver.report import SolveReport  # noqa: E402
 from groma.solver.solve import solve  # noqa: E402
@@ -159,7 +159,7 @@ def main() -> int:
     if unknown := {*wanted} - {*names}:
         parser.error(f"no such problem: {', '.join(sorted(unknown))}")
     # the stages of a report are timed by this clock: CPU time instead of wall time, so that other work does not count
-    solver_report.time = SimpleNamespace(perf_counter=time.process_time)
+    _stopwatch.time = SimpleNamespace(perf_counter=time.process_time)
     flops, bandwidth = peak_rates()
     lines = [
         f"One thread: {flops / 1e9:.1f} GFLOP/s (matrix product), {bandwidth / 1e9:.1f} GB/s (sum of arrays).",
