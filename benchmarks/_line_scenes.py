@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -125,52 +126,38 @@ def _triangulated(folder: Path) -> Scene:
     return read_scene(model_folder)
 
 
+#: Smaller images of the same view.
+SMALL: dict[str, Any] = {"width": 640, "height": 480, "focal": 560.0}
+#: Settings of the scenes of boxes.
+_BOXES = {
+    "boxes": BoxSettings(seed=3),
+    "boxes-textured": BoxSettings(seed=11, texture=8.0),
+    "boxes-fine": BoxSettings(seed=35, texture=10.0, blotches=256),
+    "boxes-rough": BoxSettings(seed=34, texture=15.0, **SMALL),
+    "boxes-strong": BoxSettings(seed=42, texture=20.0),
+    "boxes-strong-small": BoxSettings(seed=43, texture=20.0, **SMALL),
+    "boxes-small": BoxSettings(seed=5, **SMALL),
+    "boxes-random": BoxSettings(seed=115, cameras="random"),
+    "boxes-random-small": BoxSettings(seed=117, cameras="random", **SMALL),
+    "boxes-noisy": BoxSettings(seed=110, noise=6.0),
+    "boxes-wide": BoxSettings(seed=106, width=640, height=480, focal=480.0),
+    "boxes-few": BoxSettings(seed=119, num_images=12),
+    "boxes-many": BoxSettings(seed=121, num_images=48),
+    "boxes-held-small": BoxSettings(seed=401, texture=10.0, **SMALL),
+    "boxes-held-random": BoxSettings(seed=403, texture=12.0, cameras="random"),
+    "boxes-held-many": BoxSettings(seed=404, num_images=48, texture=10.0, **SMALL),
+    # Rendered on 23 November 2026, when nothing was changed any more.
+    "boxes-new-tex10": BoxSettings(seed=1301, texture=10.0),
+    "boxes-new-tex20": BoxSettings(seed=1302, texture=20.0),
+    "boxes-new-tex10-small": BoxSettings(seed=1303, texture=10.0, **SMALL),
+    "boxes-new-tex20-small": BoxSettings(seed=1304, texture=20.0, **SMALL),
+    "boxes-round": BoxSettings(seed=621, num_boxes=5, num_round=9, num_images=36, texture=6.0),
+    "boxes-round-small": BoxSettings(seed=622, num_boxes=4, num_round=9, **SMALL),
+    "boxes-round-random": BoxSettings(seed=623, num_boxes=4, num_round=9, texture=10.0, cameras="random"),
+}
 #: By name: what makes the scene from the folder of data.
 SCENES: dict[str, Callable[[Path], LineScene]] = {
-    "boxes": lambda data: boxes("boxes", BoxSettings(seed=3)),
-    "boxes-textured": lambda data: boxes("boxes-textured", BoxSettings(seed=11, texture=8.0)),
-    "boxes-fine": lambda data: boxes("boxes-fine", BoxSettings(seed=35, texture=10.0, blotches=256)),
-    "boxes-rough": lambda data: boxes(
-        "boxes-rough", BoxSettings(seed=34, texture=15.0, width=640, height=480, focal=560.0)
-    ),
-    "boxes-strong": lambda data: boxes("boxes-strong", BoxSettings(seed=42, texture=20.0)),
-    "boxes-strong-small": lambda data: boxes(
-        "boxes-strong-small", BoxSettings(seed=43, texture=20.0, width=640, height=480, focal=560.0)
-    ),
-    "boxes-small": lambda data: boxes("boxes-small", BoxSettings(seed=5, width=640, height=480, focal=560.0)),
-    "boxes-random": lambda data: boxes("boxes-random", BoxSettings(seed=115, cameras="random")),
-    "boxes-random-small": lambda data: boxes(
-        "boxes-random-small", BoxSettings(seed=117, width=640, height=480, focal=560.0, cameras="random")
-    ),
-    "boxes-noisy": lambda data: boxes("boxes-noisy", BoxSettings(seed=110, noise=6.0)),
-    "boxes-wide": lambda data: boxes("boxes-wide", BoxSettings(seed=106, width=640, height=480, focal=480.0)),
-    "boxes-few": lambda data: boxes("boxes-few", BoxSettings(seed=119, num_images=12)),
-    "boxes-many": lambda data: boxes("boxes-many", BoxSettings(seed=121, num_images=48)),
-    "boxes-held-small": lambda data: boxes(
-        "boxes-held-small", BoxSettings(seed=401, texture=10.0, width=640, height=480, focal=560.0)
-    ),
-    "boxes-held-random": lambda data: boxes("boxes-held-random", BoxSettings(seed=403, texture=12.0, cameras="random")),
-    "boxes-held-many": lambda data: boxes(
-        "boxes-held-many", BoxSettings(seed=404, num_images=48, texture=10.0, width=640, height=480, focal=560.0)
-    ),
-    # Rendered on 23 November 2026, when nothing was changed any more.
-    "boxes-new-tex10": lambda data: boxes("boxes-new-tex10", BoxSettings(seed=1301, texture=10.0)),
-    "boxes-new-tex20": lambda data: boxes("boxes-new-tex20", BoxSettings(seed=1302, texture=20.0)),
-    "boxes-new-tex10-small": lambda data: boxes(
-        "boxes-new-tex10-small", BoxSettings(seed=1303, texture=10.0, width=640, height=480, focal=560.0)
-    ),
-    "boxes-new-tex20-small": lambda data: boxes(
-        "boxes-new-tex20-small", BoxSettings(seed=1304, texture=20.0, width=640, height=480, focal=560.0)
-    ),
-    "boxes-round": lambda data: boxes(
-        "boxes-round", BoxSettings(seed=621, num_boxes=5, num_round=9, num_images=36, texture=6.0)
-    ),
-    "boxes-round-small": lambda data: boxes(
-        "boxes-round-small", BoxSettings(seed=622, num_boxes=4, num_round=9, width=640, height=480, focal=560.0)
-    ),
-    "boxes-round-random": lambda data: boxes(
-        "boxes-round-random", BoxSettings(seed=623, num_boxes=4, num_round=9, texture=10.0, cameras="random")
-    ),
+    **{name: lambda _, name=name: boxes(name, _BOXES[name]) for name in _BOXES},
     "pavilion": lambda data: pavilion("pavilion", data / "pavilion_chair"),
     "fountain": lambda data: strecha("fountain", data / "strecha_fountain_p11"),
     "herz-jesus": lambda data: strecha("herz-jesus", data / "strecha_herz_jesus_p8"),

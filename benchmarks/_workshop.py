@@ -154,6 +154,14 @@ def calibrate() -> float:
     return result["cpu_s"]
 
 
+def keep_results(name: str, content: dict, text: str) -> None:
+    """Write what was measured and its table, and print the table."""
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n")
+    (RESULTS / f"{name}.md").write_text(text + "\n")
+    print(text)
+
+
 def machine() -> dict[str, object]:
     """Return what the reader of a result must know about the machine."""
     name = platform.processor() or platform.machine()

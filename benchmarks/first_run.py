@@ -30,7 +30,7 @@ from importlib import import_module
 from pathlib import Path
 
 import numpy as np
-from _workshop import RESULTS, environment, machine
+from _workshop import environment, keep_results, machine
 from latency import whole_process
 
 
@@ -137,9 +137,7 @@ def main() -> int:
             for kind in ("wall_s", "cpu_s")
         }
         rows.append({"command": name, **row, "ratio": row["first_wall_s"] / row["second_wall_s"]})
-    RESULTS.mkdir(exist_ok=True)
     found = {"problem": "first run", "machine": machine(), "python": arguments.python, "rows": rows}
-    (RESULTS / "first_run.json").write_text(json.dumps(found, indent=1) + "\n")
     lines = [
         "| command | first, wall s | CPU s | second, wall s | CPU s | first / second |",
         "|---|--:|--:|--:|--:|--:|",
@@ -149,8 +147,7 @@ def main() -> int:
         f"| {row['second_wall_s']:.1f} | {row['second_cpu_s']:.1f} | {row['ratio']:.1f} |"
         for row in rows
     ]
-    (RESULTS / "first_run.md").write_text("\n".join(lines) + "\n")
-    print("\n".join(lines))
+    keep_results("first_run", found, "\n".join(lines))
     return 0
 
 

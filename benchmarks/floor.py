@@ -16,7 +16,6 @@ The setup is not a stage of a step and has no floor here. Writes ``benchmarks/re
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import statistics
 import sys
@@ -25,7 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
-from _workshop import CACHE, PROBLEMS, RESULTS, ROOT, THREAD_VARIABLES, machine
+from _workshop import CACHE, PROBLEMS, ROOT, THREAD_VARIABLES, keep_results, machine
 
 for _variable in THREAD_VARIABLES:
     os.environ[_variable] = "1"
@@ -33,12 +32,12 @@ os.environ.setdefault("NUMBA_CACHE_DIR", str(CACHE / "numba"))
 
 import numpy as np  # noqa: E402
 
+from groma import _stopwatch  # noqa: E402
 from groma.adjustment.assemble import assemble  # noqa: E402
 from groma.adjustment.assembly_options import AssemblyOptions  # noqa: E402
 from groma.io import read_scene  # noqa: E402
 from groma.problem.lay_out import lay_out  # noqa: E402
 from groma.problem.layout import Layout  # noqa: E402
-from groma.solver import report as solver_report  # noqa: E402
 from groma.solver.options import SolverOptions  # noqa: E402
 from groma.solver.report import SolveReport  # noqa: E402
 from groma.solver.solve import solve  # noqa: E402
@@ -160,7 +159,7 @@ def main() -> int:
     if unknown := {*wanted} - {*names}:
         parser.error(f"no such problem: {', '.join(sorted(unknown))}")
     # the stages of a report are timed by this clock: CPU time instead of wall time, so that other work does not count
-    solver_report.time = SimpleNamespace(perf_counter=time.process_time)
+    _stopwatch.time = SimpleNamespace(perf_counter=time.process_time)
     flops, bandwidth = peak_rates()
     lines = [
         f"One thread: {flops / 1e9:.1f} GFLOP/s (matrix product), {bandwidth / 1e9:.1f} GB/s (sum of arrays).",
@@ -196,10 +195,6 @@ def main() -> int:
             f"| {1e3 * floor:.1f} | {total / floor:.1f} |"
         )
         results.append({**entry, "cpu_s": total, "setup_s": seconds["setup"], "floor_s": floor})
-    text = "\n".join(lines) + "\n"
-    print(text)
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "floor.md").write_text(text)
     content = {
         "problem": "floor",
         "machine": machine(),
@@ -208,7 +203,7 @@ def main() -> int:
         "results": results,
         "metrics": {f"{r['problem']}_over_floor": r["cpu_s"] / r["floor_s"] for r in results},
     }
-    (RESULTS / "floor.json").write_text(json.dumps(content, indent=1) + "\n")
+    keep_results("floor", content, "\n".join(lines))
     return 0
 
 

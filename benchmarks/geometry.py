@@ -11,12 +11,11 @@ they were made of. Writes ``benchmarks/results/geometry.json`` and ``geometry.md
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import sys
 
 import peers
-from _workshop import CONTESTANTS, RESULTS, machine, run_program
+from _workshop import CONTESTANTS, keep_results, machine, run_program
 
 OPERATIONS = ("made", "transformed", "transformed_and_projected")
 #: Image lines pass through the pixels of their points to this fraction of the pixels.
@@ -56,13 +55,10 @@ def main() -> int:
     peer = rates.get("spatialmath")
     if peer is not None:
         result["metrics"] = {f"{kind}_ratio_spatialmath": rates["groma"][kind] / peer[kind] for kind in OPERATIONS}
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "geometry.json").write_text(json.dumps(result, indent=1) + "\n")
     lines = ["| lines per second | " + " | ".join(rates) + " |", "|---|" + "--:|" * len(rates)]
     for kind in OPERATIONS:
         lines.append(f"| {kind.replace('_', ' ')} | " + " | ".join(f"{row[kind]:.3g}" for row in rates.values()) + " |")
-    (RESULTS / "geometry.md").write_text("\n".join(lines) + "\n")
-    print("\n".join(lines))
+    keep_results("geometry", result, "\n".join(lines))
     for name, error in result["median_error"].items():
         if error > AGREEMENT:
             print(f"{name}: transformed lines miss the transformed points by {error:.1g} of their pixels (median).")

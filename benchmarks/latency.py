@@ -17,7 +17,6 @@ Medians; writes ``benchmarks/results/latency.json`` and ``latency.md``.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import resource
 import statistics
@@ -27,7 +26,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from _workshop import CONTESTANTS, PROBLEMS, RESULTS, ROOT, calibrate, environment, machine, run_program
+from _workshop import CONTESTANTS, PROBLEMS, ROOT, calibrate, environment, keep_results, machine, run_program
 
 
 def whole_process(command: list[str], cache: str) -> dict[str, float]:
@@ -92,8 +91,6 @@ def main() -> int:
         "next_adjust_in_calibrations": result["next_adjust"]["cpu_s"] / unit,
         "import_in_calibrations": result["import"]["cpu_s"] / unit,
     }
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "latency.json").write_text(json.dumps(result, indent=1) + "\n")
     frame = result["motion_only_ms"]
     adjusting = f"`groma adjust` {problem.title}"
     rows = [
@@ -110,8 +107,7 @@ def main() -> int:
     lines = ["| what | wall s | CPU s |", "|---|--:|--:|"]
     for what, wall, cpu in rows:
         lines.append(f"| {what} | {'' if wall is None else f'{wall:.3f}'} | {cpu:.4f} |")
-    (RESULTS / "latency.md").write_text("\n".join(lines) + "\n")
-    print("\n".join(lines))
+    keep_results("latency", result, "\n".join(lines))
     return 0
 
 

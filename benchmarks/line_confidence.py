@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from _line_scenes import MIN_LENGTH, SCENES, LineScene, boxes, unseen
+from _line_scenes import MIN_LENGTH, SCENES, SMALL, LineScene, boxes, unseen
 from _rendered_boxes import BoxSettings
 from _workshop import CACHE, ROOT
 from scipy.optimize import minimize
@@ -42,19 +42,18 @@ from groma.mapping.options import MapOptions
 from groma.scene import Scene
 from groma.scene.line_intervals import line_pieces, supported_lengths
 
-_SMALL = {"width": 640, "height": 480, "focal": 560.0}
 #: Rendered for this, and for nothing else.
 CHOSEN_ON = {
-    "train-small": BoxSettings(seed=501, texture=10.0, **_SMALL),
+    "train-small": BoxSettings(seed=501, texture=10.0, **SMALL),
     "train-strong": BoxSettings(seed=502, texture=20.0),
-    "train-strong-small": BoxSettings(seed=503, texture=16.0, **_SMALL),
+    "train-strong-small": BoxSettings(seed=503, texture=16.0, **SMALL),
     "train-random": BoxSettings(seed=504, texture=12.0, cameras="random"),
-    "train-fine": BoxSettings(seed=505, texture=10.0, blotches=256, **_SMALL),
+    "train-fine": BoxSettings(seed=505, texture=10.0, blotches=256, **SMALL),
     "train-few": BoxSettings(seed=506, num_images=12, texture=12.0),
-    "train-noisy": BoxSettings(seed=507, noise=6.0, texture=6.0, **_SMALL),
-    "train-many": BoxSettings(seed=508, num_images=40, texture=10.0, **_SMALL),
+    "train-noisy": BoxSettings(seed=507, noise=6.0, texture=6.0, **SMALL),
+    "train-many": BoxSettings(seed=508, num_images=40, texture=10.0, **SMALL),
     "train-round": BoxSettings(seed=611, num_boxes=5, num_round=9, texture=6.0),
-    "train-round-small": BoxSettings(seed=612, num_boxes=4, num_round=9, num_images=36, **_SMALL),
+    "train-round-small": BoxSettings(seed=612, num_boxes=4, num_round=9, num_images=36, **SMALL),
     "train-round-random": BoxSettings(seed=613, num_boxes=4, num_round=9, texture=10.0, cameras="random"),
 }
 #: Scenes of benchmarks/lines.py that have edges; none was used for the fit.

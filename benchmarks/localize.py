@@ -183,8 +183,7 @@ def held_out(map_: Path, images: Path, truth: Path, align: bool, every: int = 1)
             if found.pose.cam_from_world is None or found.pose.center_sigma is None or covariance is None:
                 rows.append((query, found.pose.status, None, None, None, None, seconds, found.seconds))
                 continue
-            here = np.asarray(_matrix(found.pose.cam_from_world) @ np.linalg.inv(moved), np.float64)
-            pose = np.concatenate([quaternion.from_matrix(here[None, :3, :3])[0], here[:3, 3]])
+            pose = se3.from_matrix(se3.to_matrix(found.pose.cam_from_world) @ np.linalg.inv(moved))
             sigma = float(np.linalg.norm(found.pose.center_sigma))
             way = se3.log(se3.compose(poses[query][None], se3.inverse(pose[None])))[0]
             square = float(way @ np.linalg.solve(covariance, way)) / 6.0
@@ -215,22 +214,12 @@ def _summary(rows: list[tuple]) -> dict[str, object]:
 
 def _alignment(scene, poses: dict[str, np.ndarray]) -> np.ndarray:
     """The motion (4, 4) from the world of a map to that of the truth: mean turn, mean shift."""
-    pairs = [
-        (_matrix(poses[name]), _matrix(pose))
-        for name, pose in zip(scene.images.names, scene.cam_from_world, strict=True)
-    ]
-    U, _, Vt = np.linalg.svd(sum((np.linalg.inv(true) @ own)[:3, :3] for true, own in pairs))
+    true = np.linalg.inv(se3.to_matrix(np.array([poses[name] for name in scene.images.names])))
+    U, _, Vt = np.linalg.svd((true @ se3.to_matrix(scene.cam_from_world))[:, :3, :3].sum(axis=0))
     moved = np.eye(4)
     moved[:3, :3] = U @ Vt
-    centers = [(np.linalg.inv(true)[:3, 3], np.linalg.inv(own)[:3, 3]) for true, own in pairs]
-    moved[:3, 3] = np.mean([true - moved[:3, :3] @ own for true, own in centers], axis=0)
+    moved[:3, 3] = (true[:, :3, 3] - scene.cam_centers_in_world @ moved[:3, :3].T).mean(axis=0)
     return moved
-
-
-def _matrix(pose: np.ndarray) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = quaternion.to_matrix(pose[None, :4])[0], pose[4:]
-    return matrix
 
 
 if __name__ == "__main__":

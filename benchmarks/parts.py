@@ -28,7 +28,6 @@ no cost tells apart what lies within sqrt(2 eps cost) standard deviations of it,
 
 import argparse
 import json
-import os
 import resource
 import shutil
 import subprocess
@@ -155,11 +154,15 @@ def started(folder: Path, arguments: argparse.Namespace, ranks: int = 1, plain: 
     own = [sys.executable, __file__, "--run", folder, "--steps", arguments.steps, "--threads", arguments.threads]
     own += ["--keep", arguments.keep, "--shared-system", arguments.shared_system]
     own += ["--plain-sums"] if plain else []
+    return json.loads(launched(own, ranks).splitlines()[-1])
+
+
+def launched(command: list, ranks: int) -> bytes:
+    """Run a command in so many processes together; return what they print."""
     if ranks > 1:
         launcher = shutil.which("mpiexec", path=sysconfig.get_path("scripts")) or "mpiexec"
-        own = [launcher, "-n", ranks, *own]
-    done = subprocess.run([str(word) for word in own], check=True, capture_output=True, env=os.environ)
-    return json.loads(done.stdout.splitlines()[-1])
+        command = [launcher, "-n", ranks, *command]
+    return subprocess.run([str(word) for word in command], check=True, capture_output=True).stdout
 
 
 def compare_ranks(folder: Path, observations: int, arguments: argparse.Namespace) -> None:
@@ -247,11 +250,10 @@ def compare_states(images: int, ranks: list[int], work: Path) -> None:
     ends = uncertainty(solved, problem=solution.problem).segment_ends
     sigma = position_sigma(ends.reshape(-1, 3, 3)).reshape(-1, 2)
     print("| ranks | poses | points | lines | planes | same files as of the first |\n|--:|--:|--:|--:|--:|---|")
-    launcher, files = shutil.which("mpiexec", path=sysconfig.get_path("scripts")) or "mpiexec", []
+    files = []
     for number in ranks:
         output = work / f"of-{number}"
-        own = [launcher, "-n", number, sys.executable, __file__, "--run-states", work / "parts", "--work", output]
-        subprocess.run([str(word) for word in own], check=True, capture_output=True, env=os.environ)
+        launched([sys.executable, __file__, "--run-states", work / "parts", "--work", output], number)
         found = join_parts(parts_of(output))
         files.append([path.read_bytes() for path in parts_of(output)])
         off = [

@@ -16,14 +16,13 @@ it, would not fit is left out. Writes ``benchmarks/results/scale.json``, ``scale
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import statistics
 import subprocess
 import sys
 
 import _plots
-from _workshop import CACHE, CONTESTANTS, RESULTS, environment, machine, run_program
+from _workshop import CACHE, CONTESTANTS, RESULTS, environment, keep_results, machine, run_program
 
 #: Observations per image of the corridor.
 PER_IMAGE = 900
@@ -108,8 +107,8 @@ def main() -> int:
         row["step_s"] = (row["cpu_s"] - row["setup_s"]) / max(1, row["iterations"])
         rows.append(row)
     result = summary(rows, arguments.project)
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "scale.json").write_text(json.dumps({**result, "machine": machine(), "sizes": rows}, indent=1) + "\n")
+    text = table(rows) + "\n" + "\n".join(result["sentences"])
+    keep_results("scale", {**result, "machine": machine(), "sizes": rows}, text)
     observations = [row["observations"] for row in rows]
     _plots.write(
         RESULTS / "scale.svg",
@@ -121,9 +120,6 @@ def main() -> int:
             _plots.Line("after the first", observations, [row["later_step_s"] for row in rows]),
         ],
     )
-    text = table(rows) + "\n" + "\n".join(result["sentences"]) + "\n"
-    (RESULTS / "scale.md").write_text(text)
-    print("\n" + text)
     return 0
 
 

@@ -15,11 +15,11 @@ from types import SimpleNamespace
 from _common import Clock, peak_memory_mib, report
 
 import groma.solver.joint as joint
+from groma import _stopwatch
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.io import read_scene
 from groma.scene import Scene, synthetic
-from groma.solver import report as solver_report
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 
@@ -32,7 +32,7 @@ def problem_of(scene: Scene):
 def main() -> None:
     path, steps, threads = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
     if threads == 1:  # the stages of a report are then timed by CPU time, so that other work does not count
-        solver_report.time = SimpleNamespace(perf_counter=time.process_time)
+        _stopwatch.time = SimpleNamespace(perf_counter=time.process_time)
     small = problem_of(synthetic.corridor(120).start.points_only())
     threshold = joint.COMPACT_FROM
     for bytes_ in (threshold, 0):

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial import KDTree
 
 from groma.io.colmap.large_photographs import features_of_large
-from groma.io.colmap.quiet import quiet
+from groma.io.colmap.load import quiet
 
 NAMES = ["large.png", "plain.png", "small.png"]
 

@@ -10,7 +10,7 @@ from groma.errors import FileFormatError, InputError
 from groma.io import read_colmap, to_pycolmap, write_colmap
 from groma.io.colmap import mappers
 from groma.io.colmap import sfm as colmap_sfm
-from groma.io.colmap.load import load_pycolmap
+from groma.io.colmap.load import load_pycolmap, opened
 from groma.io.colmap.pairs import blocks_of_pairs, pair_blocks
 from groma.io.colmap.sfm import PointModelOptions, reconstruct_points
 from groma.scene.synthetic.scenes import holistic
@@ -112,7 +112,7 @@ def test_all_images_that_pycolmap_cannot_read_are_named_at_once(tmp_path):
 
 def test_images_are_linked_by_pairs_of_many_matches(tmp_path):
     pycolmap = load_pycolmap()
-    with colmap_sfm._opened(pycolmap, tmp_path / "database.db") as content:
+    with opened(pycolmap, tmp_path / "database.db") as content:
         camera = content.write_camera(pycolmap.Camera(model="SIMPLE_PINHOLE", width=9, height=9, params=[9, 4, 4]))
         one, two, three, four = (
             content.write_image(pycolmap.Image(name=name, camera_id=camera)) for name in ("a", "b", "c", "d")

@@ -10,6 +10,7 @@ import json
 import math
 import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 import numpy as np
@@ -55,6 +56,15 @@ def read_document(path: str | os.PathLike[str]) -> Any:
 def begins_with(head: bytes, mark: bytes) -> bool:
     """Whether the first bytes of a file are those of a document that starts with the given ``{`` or ``[``."""
     return head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(mark)
+
+
+def names_early(path: Path, head: bytes, mark: bytes, *names: str) -> bool:
+    """Whether a document that starts with ``mark`` has one of the names in quotes in its first 64 kB."""
+    if not begins_with(head, mark):
+        return False
+    with path.open("rb") as file:
+        start = file.read(1 << 16)
+    return any(f'"{name}"'.encode() in start for name in names)
 
 
 def of_kind(value: Any, kind: type[_Kind], place: object) -> _Kind:

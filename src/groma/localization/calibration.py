@@ -11,8 +11,7 @@ import numpy as np
 
 from groma.errors import InputError, did_you_mean
 from groma.gates import gate
-from groma.io.colmap.load import load_pycolmap
-from groma.io.colmap.quiet import quiet
+from groma.io.colmap.load import load_pycolmap, quiet
 from groma.localization.localizer import unknown_camera
 from groma.localization.pose.camera import QueryCamera
 

@@ -6,8 +6,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -64,10 +63,10 @@ class Journal:
         """Give the folder free for others; what was noted stays."""
         self._lock.close()
 
-    @contextmanager
-    def _writing(self) -> Iterator[None]:
+    def _keep(self, note: Callable[[], None]) -> None:
         try:
-            yield
+            if not self.warnings:
+                note()
         except OSError as error:
             self.warnings.append(
                 f"From some frame on nothing was kept in {self._folder} while the track ran: {system_reason(error)}."
@@ -75,9 +74,7 @@ class Journal:
 
     def frame(self, tracked: TrackedFrame, frame: Frame, tracker: Tracker) -> None:
         """Note what became of a frame, its pose if it has one, and now and then the picture."""
-        if not self.warnings:
-            with self._writing():
-                self._frame(tracked, frame, tracker)
+        self._keep(lambda: self._frame(tracked, frame, tracker))
 
     def _frame(self, tracked: TrackedFrame, frame: Frame, tracker: Tracker) -> None:
         if tracked.pose is not None:
@@ -111,9 +108,7 @@ class Journal:
 
     def keyframe(self, tracker: Tracker, frame: TrackedFrame) -> None:
         """Note a keyframe that was just made."""
-        if not self.warnings:
-            with self._writing():
-                self._keyframe(tracker, frame)
+        self._keep(lambda: self._keyframe(tracker, frame))
 
     def _keyframe(self, tracker: Tracker, frame: TrackedFrame) -> None:
         self._append("keyframes.txt", frame)

@@ -4,7 +4,6 @@
 import sys
 import time
 from collections.abc import Callable, Sequence
-from types import TracebackType
 from typing import Any, Self
 
 from groma._counted import duration
@@ -36,9 +35,7 @@ class Line:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self._wipe()
 
     def _wipe(self) -> None:
@@ -107,13 +104,11 @@ class Stages(Line):
         share = done / total if total > 1 and not _has_steps(stage) else None
         self._show(self._label, parts, share)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         """Leave the last stage."""
-        if error is None:
+        if raised[0] is None:
             self._leave()
-        super().__exit__(kind, error, trace)
+        super().__exit__(*raised)
 
     def _leave(self) -> None:
         now = time.perf_counter()

@@ -17,11 +17,10 @@ import numpy as np
 from groma import cameras as camera_models
 from groma._typing import FloatArray
 from groma.geometry import quaternion
-from groma.io.colmap.load import load_pycolmap
+from groma.io.colmap.load import load_pycolmap, opened, quiet
 from groma.io.colmap.model import from_pycolmap, to_pycolmap
 from groma.io.colmap.pairs import blocks_of_pairs
-from groma.io.colmap.quiet import quiet
-from groma.io.colmap.sfm import PointModelOptions, Progress, _check_room, _explained, _find_features, _match, _opened
+from groma.io.colmap.sfm import PointModelOptions, Progress, _check_room, _explained, _find_features, _match
 from groma.scene import PosePriors, Scene
 
 #: Matches that a pair of images, or an image and a map, must agree on: COLMAP's numbers (convention: as in COLMAP).
@@ -81,7 +80,7 @@ class PosedPhotographs:
     def pairs(self) -> Iterator[MatchedPair]:
         """Yield the pairs whose matches agree on a motion between the two images."""
         pycolmap = load_pycolmap()
-        with quiet(pycolmap), _explained(self.work), _opened(pycolmap, self.database) as content:
+        with quiet(pycolmap), _explained(self.work), opened(pycolmap, self.database) as content:
             row_of = {number: row for row, number in enumerate(self.scene.images.ids.tolist())}
             cameras = {camera.camera_id: camera for camera in content.read_all_cameras()}
             places = {number: content.read_keypoints(number)[:, :2].astype(float) for number in row_of}
@@ -149,7 +148,7 @@ class PosedPhotographs:
         seen = model.point_observations
         image_ids = model.images.ids[seen.image_idx]
         pixels, points = [], []
-        with quiet(pycolmap), _explained(self.work), _opened(pycolmap, self.database) as content:
+        with quiet(pycolmap), _explained(self.work), opened(pycolmap, self.database) as content:
             places = content.read_keypoints(number)[:, :2].astype(float)
             for other in model.images.ids.tolist():
                 if other == number or not content.exists_two_view_geometry(number, other):
@@ -182,7 +181,7 @@ class PosedPhotographs:
 
 def _enter(pycolmap: Any, database: Path, scene: Scene) -> None:
     """Enter cameras, rigs, frames and images with the identifiers of a scene."""
-    with _opened(pycolmap, database) as content:
+    with opened(pycolmap, database) as content:
         if content.num_images() == scene.num_images:
             return
         content.clear_all_tables()  # a run was killed here

@@ -11,8 +11,7 @@ import numpy as np
 from groma import cameras as camera_models
 from groma._typing import IntArray
 from groma.errors import InputError
-from groma.io.colmap.load import load_pycolmap
-from groma.io.colmap.quiet import quiet
+from groma.io.colmap.load import load_pycolmap, quiet
 from groma.scene import Cameras
 
 

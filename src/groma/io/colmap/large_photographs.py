@@ -13,6 +13,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from groma.io.colmap.load import opened
+
 #: Longer side from which a photograph is large, pixels (cost: time only).
 _LARGE = 2000
 
@@ -33,16 +35,16 @@ def features_of_large(pycolmap: Any, database: Path, images: Path, names: Sequen
     extraction : pycolmap.FeatureExtractionOptions
         As for all photographs; changed temporarily.
     """
-    content = pycolmap.Database.open(str(database))
-    entered = {name: content.read_image_with_name(name) for name in names}
-    cameras = {name: content.read_camera(image.camera_id) for name, image in entered.items()}
+    with opened(pycolmap, database) as content:
+        entered = {name: content.read_image_with_name(name) for name in names}
+        cameras = {name: content.read_camera(image.camera_id) for name, image in entered.items()}
     large = [name for name in names if max(cameras[name].width, cameras[name].height) > _LARGE]
     if not large:
-        content.close()
         return list(names)
     beside = database.with_name("large.db")
     beside.unlink(missing_ok=True)
-    pycolmap.Database.open(str(beside)).close()
+    with opened(pycolmap, beside):
+        pass
     pycolmap.import_images(beside, images, pycolmap.CameraMode.AUTO, large)
     sift = extraction.sift
     sift.first_octave, sift.num_octaves = sift.first_octave + 1, sift.num_octaves - 1
@@ -50,16 +52,15 @@ def features_of_large(pycolmap: Any, database: Path, images: Path, names: Sequen
         beside, images, image_names=large, extraction_options=extraction, device=pycolmap.Device.cpu
     )
     sift.first_octave, sift.num_octaves = sift.first_octave - 1, sift.num_octaves + 1
-    found, enough = pycolmap.Database.open(str(beside)), set()
-    for name in large:
-        source, target = found.read_image_with_name(name).image_id, entered[name].image_id
-        if found.num_keypoints_for_image(source) < sift.max_num_features:
-            continue
-        with pycolmap.DatabaseTransaction(content):
-            content.write_keypoints(target, found.read_keypoints(source))
-            content.write_descriptors(target, found.read_descriptors(source))
-        enough.add(name)
-    found.close()
-    content.close()
+    enough = set()
+    with opened(pycolmap, beside) as found, opened(pycolmap, database) as content:
+        for name in large:
+            source, target = found.read_image_with_name(name).image_id, entered[name].image_id
+            if found.num_keypoints_for_image(source) < sift.max_num_features:
+                continue
+            with pycolmap.DatabaseTransaction(content):
+                content.write_keypoints(target, found.read_keypoints(source))
+                content.write_descriptors(target, found.read_descriptors(source))
+            enough.add(name)
     beside.unlink()
     return [name for name in names if name not in enough]

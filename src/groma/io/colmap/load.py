@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""pycolmap, loaded so that it does no harm to the process around it.
+"""pycolmap, loaded so that it does no harm to the process around it; its log kept off the terminal; its databases.
 
 zlib must be loaded first: pycolmap's wheel (4.2) exports functions of the same names, which otherwise break it (heap
 corruption). And pycolmap takes SIGTERM, and answers it with a page of addresses; it is given back.
@@ -10,6 +10,9 @@ from __future__ import annotations
 import signal
 import threading
 import zlib  # noqa: F401
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 
@@ -22,3 +25,24 @@ def load_pycolmap() -> Any:
         if before is not None:
             signal.signal(signal.SIGTERM, before)
     return pycolmap
+
+
+@contextmanager
+def quiet(pycolmap: Any) -> Iterator[None]:
+    """Silence the log of pycolmap; its errors are reported by groma."""
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level
+
+
+@contextmanager
+def opened(pycolmap: Any, database: Path) -> Iterator[Any]:
+    """Open a database, and make it where there is none."""
+    content = pycolmap.Database.open(str(database))
+    try:
+        yield content
+    finally:
+        content.close()

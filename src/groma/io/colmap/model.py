@@ -37,8 +37,7 @@ from groma.io.colmap.files import (
     models_in_parts,
     points_in_images,
 )
-from groma.io.colmap.load import load_pycolmap
-from groma.io.colmap.quiet import quiet
+from groma.io.colmap.load import load_pycolmap, quiet
 from groma.io.colmap.to_pycolmap import colmap_camera, to_pycolmap
 from groma.io.limap.structures import Structures, read_beside, write_beside
 from groma.io.reading import reading, warn_of_the_others

@@ -22,6 +22,7 @@ from groma._counted import counted
 from groma._typing import FloatArray
 from groma.bounded.documents import member, of_kind, read_document, table
 from groma.errors import FileFormatError, InputError
+from groma.io.colmap.load import opened
 
 #: How COLMAP calls such a file.
 RIG_FILE = "rig_config.json"
@@ -149,12 +150,9 @@ def map_frames(
             return []
     with_rigs = database.with_name("rigs.db")
     shutil.copyfile(database, with_rigs)
-    content = pycolmap.Database.open(str(with_rigs))
-    try:
+    with opened(pycolmap, with_rigs) as content:
         pycolmap.apply_rig_config([_configured(pycolmap, rig) for rig in rigs], content, alone)
         poses = [pose for rig in content.read_all_rigs() for pose in rig.non_ref_sensors.values()]
-    finally:
-        content.close()
     if any(pose is None for pose in poses):
         raise InputError(
             "Where a camera sits on its rig could not be found from the images. Add cam_from_rig_rotation and "

@@ -25,11 +25,10 @@ from groma import cameras as camera_models
 from groma._counted import counted, first_of
 from groma.errors import GromaError, InputError, OutputError, did_you_mean
 from groma.io.colmap.large_photographs import features_of_large
-from groma.io.colmap.load import load_pycolmap
+from groma.io.colmap.load import load_pycolmap, opened, quiet
 from groma.io.colmap.mappers import MAPPERS, Task
 from groma.io.colmap.model import from_pycolmap
 from groma.io.colmap.pairs import EXHAUSTIVE_LIMIT, OVERLAP, blocks_of_pairs, places_by_gps
-from groma.io.colmap.quiet import quiet
 from groma.io.colmap.rigs import RigDescription, by_frames, camera_of, check_rigs, map_frames
 from groma.scene import Scene
 
@@ -157,7 +156,7 @@ def reconstruct_points(
         _enter_images(pycolmap, database, Path(images), names, options)
         _expect_fisheyes(pycolmap, database)
         _find_features(pycolmap, database, Path(images), names, options, say)
-        with _opened(pycolmap, database) as content:
+        with opened(pycolmap, database) as content:
             ordered = by_frames(options.rigs, names)
             places = places_by_gps(content, ordered)
         _match(pycolmap, database, ordered, blocks_of_pairs(len(names), places), options, say)
@@ -171,7 +170,7 @@ def reconstruct_points(
             ),
         )
     if not models:
-        with _opened(pycolmap, database) as content:
+        with opened(pycolmap, database) as content:
             features, matches = content.num_keypoints(), content.num_inlier_matches()
             linked = _most_linked(pycolmap, content)
         raise InputError(
@@ -216,14 +215,14 @@ def _why_none(features: int, matches: int, count: int, linked: int) -> str:
 def _enter_images(pycolmap: Any, database: Path, images: Path, names: list[str], options: PointModelOptions) -> None:
     """Enter cameras and images in order, so that their identifiers do not depend on threads."""
     try:
-        with _opened(pycolmap, database) as content:
+        with opened(pycolmap, database) as content:
             if content.num_images() == len(names):
                 return
             content.clear_all_tables()  # a run was killed here
     except RuntimeError:  # damaged: start again
         for path in database.parent.glob(f"{database.name}*"):
             path.unlink()
-        with _opened(pycolmap, database):
+        with opened(pycolmap, database):
             pass
     groups: dict[tuple[Any, ...], list[str]] = {}
     unread = []
@@ -260,7 +259,7 @@ def _expect_fisheyes(pycolmap: Any, database: Path) -> None:
 
     Without calibration pycolmap relates two images by a fundamental matrix, which fisheyes lack, and finds no pair.
     """
-    with _opened(pycolmap, database) as content:
+    with opened(pycolmap, database) as content:
         for camera in content.read_all_cameras():
             if camera.is_perspective_fisheye() and not camera.has_prior_focal_length:
                 params = camera.params
@@ -272,7 +271,7 @@ def _expect_fisheyes(pycolmap: Any, database: Path) -> None:
 def _find_features(
     pycolmap: Any, database: Path, images: Path, names: list[str], options: PointModelOptions, say: Progress
 ) -> None:
-    with _opened(pycolmap, database) as content:
+    with opened(pycolmap, database) as content:
         done = {image.name for image in content.read_all_images() if content.exists_descriptors(image.image_id)}
     missing = [name for name in names if name not in done]
     extraction = pycolmap.FeatureExtractionOptions()
@@ -327,15 +326,6 @@ def _match(
 
 
 # ----------------------------------------------------------------------------------------------------------- helpers
-
-
-@contextmanager
-def _opened(pycolmap: Any, database: Path) -> Iterator[Any]:
-    content = pycolmap.Database.open(str(database))
-    try:
-        yield content
-    finally:
-        content.close()
 
 
 def _check_room(folder: Path, more: int = 0) -> None:

@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.bounded.documents import begins_with, member, of_kind, read_document, table
+from groma.bounded.documents import member, names_early, of_kind, read_document, table
 from groma.bounded.text import finite, shown
 from groma.errors import FileFormatError
 from groma.io.interchange.calibration import Calibration, camera_table, fisheye, polynomial
@@ -175,10 +175,9 @@ def _structure(
 
 
 def _recognise(path: Path, head: bytes) -> bool:
-    if path.is_dir() or not begins_with(head, b"{") or b'"sfm_data_version"' in head:
+    if path.is_dir() or b'"sfm_data_version"' in head:
         return False
-    with path.open("rb") as file:
-        return b'"intrinsicId"' in file.read(1 << 16)
+    return names_early(path, head, b"{", "intrinsicId")
 
 
 register_format(

@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.bounded.documents import begins_with, member, number, of_kind, read_document, size, table
+from groma.bounded.documents import member, names_early, number, of_kind, read_document, size, table
 from groma.bounded.text import finite, read_text, shown
 from groma.errors import FileFormatError
 from groma.io.interchange.calibration import Calibration, camera_table, fisheye, panorama, polynomial
@@ -227,11 +227,7 @@ def _seen(tracks: dict[str, _Tracks], images: list[str], points: list[str]) -> t
 def _recognise(path: Path, head: bytes) -> bool:
     if path.is_dir():
         return (path / _NAME).is_file()
-    if not begins_with(head, b"["):
-        return False
-    with path.open("rb") as file:
-        start = file.read(1 << 16)
-    return any(f'"{name}"'.encode() in start for name in ("cameras", "shots", "rig_cameras", "reference_lla"))
+    return names_early(path, head, b"[", "cameras", "shots", "rig_cameras", "reference_lla")
 
 
 register_format(

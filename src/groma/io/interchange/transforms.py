@@ -41,7 +41,7 @@ from typing import Any
 import numpy as np
 
 from groma import cameras as camera_models
-from groma.bounded.documents import begins_with, member, number, of_kind, read_document, size, table
+from groma.bounded.documents import member, names_early, number, of_kind, read_document, size, table
 from groma.bounded.names import IMAGES, listed_file
 from groma.bounded.text import shown
 from groma.errors import FileFormatError, InputError
@@ -296,11 +296,7 @@ def _entries(cameras: Cameras, row: int) -> dict[str, Any]:
 def _recognise(path: Path, head: bytes) -> bool:
     if path.is_dir():
         return (path / _NAME).is_file()
-    if not begins_with(head, b"{"):
-        return False
-    with path.open("rb") as file:
-        start = file.read(1 << 16)
-    return any(f'"{name}"'.encode() in start for name in ("transform_matrix", "camera_angle_x", "fl_x"))
+    return names_early(path, head, b"{", "transform_matrix", "camera_angle_x", "fl_x")
 
 
 register_format(

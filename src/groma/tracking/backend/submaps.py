@@ -100,7 +100,7 @@ def find_joint(
 
     Where a map has no metric scale, enough depths must agree on how its unit compares with that of the other.
     """
-    best: Joint | None = None
+    joints = []
     for keyframe, first, second in pairs:
         older = next((k for k, submap in enumerate(maps) if keyframe in submap.living()), newer)
         if older == newer:
@@ -111,10 +111,8 @@ def find_joint(
         if place is None or not place.stands_out(camera, options.gates):
             continue
         relative, matches = place.keyframe_from_newest, place.matches(0)
-        joint = Joint(older, keyframe.index, newer, newest.index, relative, *matches)
-        if best is None or len(joint.first) > len(best.first):
-            best = joint
-    return best
+        joints.append(Joint(older, keyframe.index, newer, newest.index, relative, *matches))
+    return max(joints, key=lambda joint: len(joint.first), default=None)
 
 
 def best_joint(
@@ -123,12 +121,8 @@ def best_joint(
     """Return the joint of two maps that most agrees with, over an even choice of the keyframes of both."""
     gates = options.gates
     older, newer = (_evenly(maps[k].living(), 2 * gates.loops.compared) for k in (one, two))
-    best = None
-    for newest in newer:
-        joint = find_joint(maps, camera, two, newest, LoopSearch(newest, older, gates).run(), options)
-        if joint is not None and (best is None or len(joint.first) > len(best.first)):
-            best = joint
-    return best
+    found = (find_joint(maps, camera, two, new, LoopSearch(new, older, gates).run(), options) for new in newer)
+    return max((joint for joint in found if joint is not None), key=lambda joint: len(joint.first), default=None)
 
 
 def _evenly(keyframes: list[Keyframe], count: int) -> list[Keyframe]:

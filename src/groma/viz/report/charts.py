@@ -57,15 +57,9 @@ def histogram(before: FloatArray | None, after: FloatArray) -> str:
     for exponent in range(-2, 3):
         x = _LEFT + (exponent + 2) * 12 * width
         beyond = {-2: "≤ ", 2: "≥ "}.get(exponent, "")  # the first and the last bar hold what lies outside
-        body.append(
-            line(x, _TOP, x, bottom, "grid")
-            + text(
-                x + 6 * (exponent == 2),
-                bottom + 16,
-                f"{beyond}{10.0**exponent:g}",
-                "end" if exponent == 2 else "middle",
-            )
-        )
+        place, anchor = (x + 6, "end") if exponent == 2 else (x, "middle")
+        body.append(line(x, _TOP, x, bottom, "grid"))
+        body.append(text(place, bottom + 16, f"{beyond}{10.0**exponent:g}", anchor))
     for name, share in shares:
         bars = [
             f'<rect x="{_LEFT + i * width:.1f}" y="{bottom - s / top * (bottom - _TOP):.1f}" width="{width - 0.6:.1f}" '

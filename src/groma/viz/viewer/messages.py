@@ -25,14 +25,8 @@ _RAMP = "linear-gradient(90deg,#2c6fbb,#3fb6a8,#e8c53a,#d9472b)"
 
 def counts(scene: Scene, max_cameras: int) -> str:
     """Return the counts of a scene, and how many cameras are drawn."""
-    parts = [
-        ("images", scene.num_images),
-        ("points", scene.num_points),
-        ("lines", scene.num_lines),
-        ("planes", scene.num_planes),
-        ("directions", scene.num_directions),
-    ]
-    text = words(parts)
+    kinds = ("images", "points", "lines", "planes", "directions")
+    text = words([(kind, getattr(scene, f"num_{kind}")) for kind in kinds])
     return text + (f". {max_cameras} of the cameras are drawn" if scene.num_images > max_cameras else "")
 
 
