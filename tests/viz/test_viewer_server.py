@@ -105,8 +105,9 @@ def test_a_page_that_comes_back_keeps_its_camera():
         return SimpleNamespace(camera=camera, atomic=contextlib.nullcontext)
 
     on["leave"](page([1.0, 2.0, 3.0], [0.0, 0.5, 0.0]))
-    back, new = page([1.0, 2.0, 3.0], [0.0, 0.0, 0.0]), page([-5.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    back, new = page([1.0, 3.0, -2.0], [0.0, 0.0, 0.0]), page([-5.0, 0.0, 0.0], [0.0, 0.0, 0.0])
     on["connect"](back)
     on["connect"](new)
     assert begun == [new]
+    np.testing.assert_array_equal(back.camera.position, [1.0, 2.0, 3.0])
     np.testing.assert_array_equal(back.camera.look_at, [0.0, 0.5, 0.0])

@@ -150,7 +150,10 @@ def _checked(doorkeeper: Doorkeeper) -> Iterator[list[bool]]:
 
 
 def keep_cameras(server: viser.ViserServer, begin: Callable[[Any], None] = lambda client: None) -> None:
-    """Give a page whose connection was cut the camera that it had; ``begin`` is called for other pages."""
+    """Give a page whose connection was cut the camera that it had; ``begin`` is called for other pages.
+
+    It tells its place before it knows the up direction, so only the distance from the origin can be compared.
+    """
     left: list[Any] = []
 
     def remember(client: Any) -> None:
@@ -159,7 +162,7 @@ def keep_cameras(server: viser.ViserServer, begin: Callable[[Any], None] = lambd
     def connected(client: Any) -> None:
         camera = client.camera
         for position, look_at, up in left:
-            if np.allclose(camera.position, position):
+            if np.isclose(np.linalg.norm(camera.position), np.linalg.norm(position)):
                 with client.atomic():
                     camera.up_direction, camera.position, camera.look_at = up, position, look_at
                 return
