@@ -13,7 +13,6 @@ from groma.cli.shared.console import Console
 
 if TYPE_CHECKING:
     from groma.localization.result import LocalizeResult
-    from groma.localization.stored import StoredImage
 
 #: Localised photographs in the table; the others are always listed (convention: what a screen can hold).
 _SHOWN = 12
