@@ -7,8 +7,8 @@ the usual distance of lines from their cameras. Four things must be true of it:
 .. math:: p = \frac{1}{1 + \exp(-w_0 - \sum_k w_k x_k - b)}\; \frac{1}{1 + \exp(-w_s - \sum_t w_t x_t - c)}\;
           \bigl(2 F_4(\tau / u) - 1\bigr)\; \operatorname{erf}\frac{1}{\sqrt 2\, r}.
 
-The first factor, that its segments belong together, is a logistic model of five quantities (:func:`line_evidence`).
-The outline of a round body is no edge, and moves with the view: its segments drift from any line that stands still, and
+The first factor, that its segments belong together, is a logistic model of five quantities (:func:`line_evidence`). The
+outline of a round body is no edge, and moves with the view: its segments drift from any line that stands still, and
 images that show the body beside it do not show it where others do. How many lines of a scene have an edge is not known
 beforehand: nearly all of a plain box, few of an upholstered chair. Their share, of log odds b, is estimated from the
 lines themselves, with a prior of m lines of which half have one (:func:`edge_probability`). The second, that they are
@@ -17,12 +17,12 @@ same contrast beside it, and its stripes are short. Each has a weight of its own
 median length is theirs. Where views agree on texture, as they do on stripes of a wall, only this factor tells. Whether
 there is such texture, the lines tell as well: where many are surely stripes, doubtful ones are likely more of them. The
 share of lines that are none, of log odds c, is estimated like the other. The third is the probability of an error
-within :math:`\tau = 0.0025`, where u is the standard deviation across the line that half of its places do not exceed, over the
-usual distance, and F the Student distribution of four degrees of freedom: errors have heavy tails, since what edges
-beside it displace is displaced in all images alike. Segments and the planes that the line lies on tell u together: of
-an edge that all images see from one height, planes know the depth. The fourth is the share of normal residuals of r
-pixels root mean square within the width of an edge, a pixel: chords of curves fit no single line, and where segments of
-a curve are bowed their standard deviations, and with them r, say so.
+within :math:`\tau = 0.0025`, where u is the standard deviation across the line that half of its places do not exceed,
+over the usual distance, and F the Student distribution of four degrees of freedom: errors have heavy tails, since what
+edges beside it displace is displaced in all images alike. Segments and the planes that the line lies on tell u
+together: of an edge that all images see from one height, planes know the depth. The fourth is the share of normal
+residuals of r pixels root mean square within the width of an edge, a pixel: chords of curves fit no single line, and
+where segments of a curve are bowed their standard deviations, and with them r, say so.
 
 No quantity depends on the unit of length or on how many pixels an image has. The weights were fitted on rendered scenes
 of boxes and round bodies whose edges are known exactly, and the probabilities compared with those of other scenes
