@@ -81,8 +81,8 @@ def test_evidence_by_hand():
     found = columns(scene_of(ends, [[-1.0, 0, 0], [1, 0, 0]], noise=0.0))
     np.testing.assert_allclose(np.exp(found["spread"]), np.sin(np.arctan(0.1)), rtol=1e-9)
     # Nothing is known of their contrast: it is the usual one.
-    np.testing.assert_allclose(np.exp(found["contrast"]), GATES.usual_contrast, rtol=1e-9)
-    np.testing.assert_allclose(np.exp(found["length"]), np.array([100.0, 1050.0]) / 575.0, rtol=1e-9)
+    usual = GATES.usual_contrast * np.array([100.0, 1050.0]) / 575.0
+    np.testing.assert_allclose(np.exp(found["prominence"]), usual, rtol=1e-9)
     # Both are seen by all images; the second leaves the frame, so that no image is expected to show it.
     np.testing.assert_allclose(np.exp(found["support"]), [5.0, 5.0])
     fewer = scene_of(ends, [[-1.0, 0, 0], [1, 0, 0], [0, 0, 1]], noise=0.0)
@@ -162,24 +162,14 @@ def test_lines_that_do_not_stand_out_are_texture(scene):
     np.testing.assert_allclose(line_evidence(part), line_evidence(whole), rtol=1e-12)
 
 
-def test_an_edge_and_texture_are_equally_likely_at_the_contrast_of_the_weights():
+def test_an_edge_and_texture_are_equally_likely_at_the_prominence_of_the_weights():
     weights = np.array(list(WEIGHTS.values()))
     rows = np.zeros((3, len(WEIGHTS)))
     rows[:, [TOGETHER.start, NO_TEXTURE.start]] = 1.0
-    limit = -WEIGHTS["texture"] / WEIGHTS["contrast"]
-    rows[:, -2] = limit + np.array([0.0, 20.0, -20.0])  # lines of the usual length
+    limit = -WEIGHTS["texture"] / WEIGHTS["prominence"]
+    rows[:, -1] = limit + np.array([0.0, 20.0, -20.0])
     at, far, below = edge_probability(rows, weights)
     assert at == pytest.approx(0.5 * far) and below < 1e-12
-
-
-def test_contrast_tells_more_than_length():
-    # Where most lines are short stripes, all others are long among them: long stripes too.
-    rows = np.zeros((202, len(WEIGHTS)))
-    rows[:, [TOGETHER.start, NO_TEXTURE.start]] = 1.0
-    rows[:, -2] = 1.0
-    rows[200:, -2:] = [[1.0, 2.5], [2.5, 1.0]]
-    long, strong = edge_probability(rows, np.array(list(WEIGHTS.values())))[200:]
-    assert long < 0.3 and strong > 0.6
 
 
 def test_the_lines_of_a_scene_tell_the_share_that_has_an_edge():
@@ -218,6 +208,24 @@ def test_the_lines_of_a_scene_tell_the_share_that_is_texture():
     # Lines whose segments do not belong together tell nothing of texture.
     unrelated = probability(0.5, *[-9.0] * 100, together=(50.0, *[-50.0] * 100))
     assert unrelated[0] == pytest.approx(alone, abs=1e-9)
+
+
+def test_where_most_lines_are_stripes_all_prominences_are_too_high():
+    weights, gates = np.array(list(WEIGHTS.values())), GATES
+
+    def probability(prominence):
+        rows = np.ones((len(prominence), len(WEIGHTS)))
+        rows[:, TOGETHER], rows[:, -1] = 50.0 / weights[TOGETHER], prominence
+        return edge_probability(rows, weights)
+
+    # Two of three lines are stripes, so that the median length, by which lengths are divided, is theirs.
+    doubtful, likely = gates.stripe_prominence + 1.7, gates.stripe_prominence + 2.7
+    usual = np.repeat([gates.stripe_prominence, gates.edge_prominence], [200, 100])
+    right, shifted = probability([*usual, doubtful]), probability([*(usual + 0.7), doubtful])
+    assert shifted[-1] < 0.6 * right[-1]
+    # Edges that are weak do not make stripes of others.
+    weak = probability([*(usual - 0.7), likely])
+    assert weak[-1] == pytest.approx(probability([*usual, likely])[-1], abs=0.02)
 
 
 def test_residuals_are_told_in_pixels_whatever_the_standard_deviations_say(scene):
@@ -317,8 +325,8 @@ def test_good_lines_are_more_probable_than_lines_of_unrelated_segments(scene):
     assert ranks[wrong].mean() < 7.0 and np.median(after[10:]) > 5.0 * np.median(after[wrong])
     fewer = line_confidence(scene.keep(line_observations=seen.image_idx < 3))
     assert (fewer < before).mean() > 0.9
-    signs = {name: np.sign(WEIGHTS[name]) for name in ("spread", "support", "contrast", "length", "residual")}
-    assert signs == {"spread": 1, "support": 1, "contrast": 1, "length": 1, "residual": -1}
+    signs = {name: np.sign(WEIGHTS[name]) for name in ("spread", "support", "prominence", "residual")}
+    assert signs == {"spread": 1, "support": 1, "prominence": 1, "residual": -1}
 
 
 def test_kept_in_archives(scene, tmp_path):

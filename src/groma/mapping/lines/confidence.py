@@ -4,7 +4,7 @@ r"""How probable it is that a line is right, from what its observations say.
 A line is called right where an edge of the object runs along it, at least along half of it, within 2.5 thousandths of
 the usual distance of lines from their cameras. Four things must be true of it:
 
-.. math:: p = \frac{1}{1 + \exp(-w_0 - \sum_k w_k x_k - b)}\; \frac{1}{1 + \exp(-w_s - \sum_t w_t x_t - c)}\;
+.. math:: p = \frac{1}{1 + \exp(-w_0 - \sum_k w_k x_k - b)}\; \frac{1}{1 + \exp(-w_s - w_t (x_t - \delta) - c)}\;
           \bigl(2 F_4(\tau / u) - 1\bigr)\; \operatorname{erf}\frac{1}{\sqrt 2\, r}.
 
 The first factor, that its segments belong together, is a logistic model of five quantities (:func:`line_evidence`). The
@@ -12,17 +12,19 @@ outline of a round body is no edge, and moves with the view: its segments drift 
 images that show the body beside it do not show it where others do. How many lines of a scene have an edge is not known
 beforehand: nearly all of a plain box, few of an upholstered chair. Their share, of log odds b, is estimated from the
 lines themselves, with a prior of m lines of which half have one (:func:`edge_probability`). The second, that they are
-no texture, is one of contrast (:mod:`groma.features.contrast`) and relative length, since texture has stripes of the
-same contrast beside it, and its stripes are short. Each has a weight of its own: where most lines are stripes, even the
-median length is theirs. Where views agree on texture, as they do on stripes of a wall, only this factor tells. Whether
-there is such texture, the lines tell as well: where many are surely stripes, doubtful ones are likely more of them. The
-share of lines that are none, of log odds c, is estimated like the other. The third is the probability of an error
-within :math:`\tau = 0.0025`, where u is the standard deviation across the line that half of its places do not exceed,
-over the usual distance, and F the Student distribution of four degrees of freedom: errors have heavy tails, since what
-edges beside it displace is displaced in all images alike. Segments and the planes that the line lies on tell u
-together: of an edge that all images see from one height, planes know the depth. The fourth is the share of normal
-residuals of r pixels root mean square within the width of an edge, a pixel: chords of curves fit no single line, and
-where segments of a curve are bowed their standard deviations, and with them r, say so.
+no texture, is one of the prominence alone: contrast (:mod:`groma.features.contrast`) times relative length, since
+texture has stripes of the same contrast beside it, and its stripes are short. Where views agree on texture, as they do
+on stripes of a wall, only this factor tells. Whether there is such texture, the lines tell as well: where many are
+surely stripes, doubtful ones are likely more of them. The share of lines that are none, of log odds c, is estimated
+like the other. Stripes are shorter than edges: where most lines are stripes, the median length is theirs, and the
+prominence of all lines is too high. By how much, :math:`\delta`, the lines tell together with the share: edges and
+stripes of a scene are, in the mean, as prominent as those of the fit, :math:`\mu_e` and :math:`\mu_t`. The third is the
+probability of an error within :math:`\tau = 0.0025`, where u is the standard deviation across the line that half of its
+places do not exceed, over the usual distance, and F the Student distribution of four degrees of freedom: errors have
+heavy tails, since what edges beside it displace is displaced in all images alike. Segments and the planes that the line
+lies on tell u together: of an edge that all images see from one height, planes know the depth. The fourth is the share
+of normal residuals of r pixels root mean square within the width of an edge, a pixel: chords of curves fit no single
+line, and where segments of a curve are bowed their standard deviations, and with them r, say so.
 
 No quantity depends on the unit of length or on how many pixels an image has. The weights were fitted on rendered scenes
 of boxes and round bodies whose edges are known exactly, and the probabilities compared with those of other scenes
@@ -56,8 +58,8 @@ from groma.scene import Scene
 
 #: The quantities, and the weight of each as ``benchmarks/line_confidence.py`` found it.
 WEIGHTS: dict[str, float] = {
-    "constant": 3.037, "spread": 1.140, "support": 1.499, "beside": 1.117, "residual": -0.920, "drift": -1.524,
-    "texture": -7.431, "contrast": 3.676, "length": 1.785,
+    "constant": 2.973, "spread": 1.118, "support": 1.476, "beside": 1.151, "residual": -0.927, "drift": -1.494,
+    "texture": -5.345, "prominence": 3.012,
 }  # fmt: skip
 
 
@@ -73,6 +75,11 @@ class ConfidenceGates:
         30.0, "lines", "that the prior on the share of lines with an edge counts for",
         "chosen on the scenes of the fit, each left out in turn",
     )  # fmt: skip
+    edge_prominence: float = gate(3.82, "1", "mean of edges", "measured on the scenes of the fit")
+    stripe_prominence: float = gate(0.25, "1", "median of stripes", "measured on the boxes of the fit")
+    prior_shift: float = gate(
+        300.0, "lines", "that the prior on the shift of prominences counts for", "chosen on rendered scenes"
+    )
     edge_px: float = gate(SEGMENTS.edge, "px", "residual of a segment of a right line", "derived from an edge's width")
     usual_contrast: float = gate(30.0, "1", "of segments whose contrast is unknown", "chosen on the scenes of the fit")
 
@@ -81,9 +88,11 @@ GATES = ConfidenceGates()
 #: Lines of a smaller probability are no part of a map: they are more likely wrong than right.
 DEFAULT_CONFIDENCE = 0.5
 #: Quantities of the two logistic models; the first of each is 1.
-TOGETHER, NO_TEXTURE = slice(0, 6), slice(6, 9)
+TOGETHER, NO_TEXTURE = slice(0, 6), slice(6, 8)
 #: Largest logarithm of the odds of an edge, and how often the interval is halved in which they lie (cost: time).
 _MOST_ODDS, _HALVINGS = 40.0, 50
+#: How often the shift of prominences and the share of texture are estimated in turn (cost: time).
+_TURNS = 20
 #: Smallest misfit and spread, below which they say nothing more.
 _MIN_MISFIT, _MIN_SPREAD = 0.3, 1e-4
 #: Shares of an information below which it is none: that of a line, and of the radius beside it (convention: rounding).
@@ -109,11 +118,16 @@ def edge_probability(evidence: FloatArray, weights: FloatArray) -> FloatArray:
     """Return the probability (L,) that there is an edge, from what :func:`line_evidence` returns and its weights.
 
     The lines are all those of a scene. Weights are of log likelihood ratios; the shares of lines whose segments belong
-    together, and of those among them that are no texture, are estimated from the lines.
+    together, and of those among them that are no texture, are estimated from the lines, and so is how much too high
+    their prominences are.
     """
     together, no_texture = (evidence[:, part] @ weights[part] for part in (TOGETHER, NO_TEXTURE))
-    belongs = _with_share(together, np.ones(len(together)))
-    return belongs * _with_share(no_texture, belongs)
+    belongs, shift, edge = _with_share(together, np.ones(len(together))), 0.0, np.ones(len(together))
+    for _ in range(_TURNS):
+        edge = _with_share(no_texture - weights[-1] * shift, belongs)
+        usual = GATES.stripe_prominence + (GATES.edge_prominence - GATES.stripe_prominence) * edge
+        shift = max(float(belongs @ (evidence[:, -1] - usual)) / (GATES.prior_shift + float(belongs.sum())), 0.0)
+    return belongs * edge
 
 
 def _with_share(ratio: FloatArray, count: FloatArray) -> FloatArray:
@@ -147,7 +161,7 @@ def line_accuracy(
 
 
 def line_evidence(scene: Scene, noise: LineNoise | None = None) -> FloatArray:
-    r"""Return what the probability that there is an edge is computed from, (L, 9), in the order of ``WEIGHTS``.
+    r"""Return what the probability that there is an edge is computed from, (L, 8), in the order of ``WEIGHTS``.
 
     ``noise`` is that of the lines, if it is known.
 
@@ -161,8 +175,8 @@ def line_evidence(scene: Scene, noise: LineNoise | None = None) -> FloatArray:
     ``drift``       logarithm of 1 + t, where t is how many standard deviations the radius is off zero of the cylinder
                     whose outlines explain its segments best
     ``texture``     1
-    ``contrast``    mean over its segments of the logarithm of their contrast
-    ``length``      logarithm of the length of its longest observed segment over the median of those of all lines
+    ``prominence``  mean over its segments of the logarithm of their contrast, plus that of its longest observed
+                    segment over the median of those of all lines
     ==============  ===============================================================================================
     """
     seen, noise = scene.line_observations, line_noise(scene) if noise is None else noise
@@ -179,8 +193,7 @@ def line_evidence(scene: Scene, noise: LineNoise | None = None) -> FloatArray:
             np.log(_residual_px(scene, noise)),
             np.log1p(np.abs(_drift(scene, noise))),
             np.ones(scene.num_lines),
-            _log_contrast(scene),
-            np.log(longest / (np.median(longest) if len(longest) else 1.0)),
+            _log_contrast(scene) + np.log(longest / (np.median(longest) if len(longest) else 1.0)),
         ]
     )
 
