@@ -210,6 +210,24 @@ def test_the_lines_of_a_scene_tell_the_share_that_is_texture():
     assert unrelated[0] == pytest.approx(alone, abs=1e-9)
 
 
+def test_where_most_lines_are_stripes_all_prominences_are_too_high():
+    weights, gates = np.array(list(WEIGHTS.values())), GATES
+
+    def probability(prominence):
+        rows = np.ones((len(prominence), len(WEIGHTS)))
+        rows[:, TOGETHER], rows[:, -1] = 50.0 / weights[TOGETHER], prominence
+        return edge_probability(rows, weights)
+
+    # Two of three lines are stripes, so that the median length, by which lengths are divided, is theirs.
+    doubtful, likely = gates.stripe_prominence + 1.7, gates.stripe_prominence + 2.7
+    usual = np.repeat([gates.stripe_prominence, gates.edge_prominence], [200, 100])
+    right, shifted = probability([*usual, doubtful]), probability([*(usual + 0.7), doubtful])
+    assert shifted[-1] < 0.6 * right[-1]
+    # Edges that are weak do not make stripes of others.
+    weak = probability([*(usual - 0.7), likely])
+    assert weak[-1] == pytest.approx(probability([*usual, likely])[-1], abs=0.02)
+
+
 def test_residuals_are_told_in_pixels_whatever_the_standard_deviations_say(scene):
     rms = np.exp(columns(scene)["residual"])
     # Lines at their true places: twelve residuals count as eight degrees of freedom.

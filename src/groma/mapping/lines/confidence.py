@@ -4,11 +4,11 @@ r"""How probable it is that a line is right, from what its observations say.
 A line is called right where an edge of the object runs along it, at least along half of it, within 2.5 thousandths of
 the usual distance of lines from their cameras. Four things must be true of it:
 
-.. math:: p = \frac{1}{1 + \exp(-w_0 - \sum_k w_k x_k - b)}\; \frac{1}{1 + \exp(-w_s - w_t x_t - c)}\;
+.. math:: p = \frac{1}{1 + \exp(-w_0 - \sum_k w_k x_k - b)}\; \frac{1}{1 + \exp(-w_s - w_t (x_t - \delta) - c)}\;
           \bigl(2 F_4(\tau / u) - 1\bigr)\; \operatorname{erf}\frac{1}{\sqrt 2\, r}.
 
-The first factor, that its segments belong together, is a logistic model of five quantities (:func:`line_evidence`).
-The outline of a round body is no edge, and moves with the view: its segments drift from any line that stands still, and
+The first factor, that its segments belong together, is a logistic model of five quantities (:func:`line_evidence`). The
+outline of a round body is no edge, and moves with the view: its segments drift from any line that stands still, and
 images that show the body beside it do not show it where others do. How many lines of a scene have an edge is not known
 beforehand: nearly all of a plain box, few of an upholstered chair. Their share, of log odds b, is estimated from the
 lines themselves, with a prior of m lines of which half have one (:func:`edge_probability`). The second, that they are
@@ -16,13 +16,15 @@ no texture, is one of the prominence alone: contrast (:mod:`groma.features.contr
 texture has stripes of the same contrast beside it, and its stripes are short. Where views agree on texture, as they do
 on stripes of a wall, only this factor tells. Whether there is such texture, the lines tell as well: where many are
 surely stripes, doubtful ones are likely more of them. The share of lines that are none, of log odds c, is estimated
-like the other. The third is the probability of an error within
-:math:`\tau = 0.0025`, where u is the standard deviation across the line that half of its places do not exceed, over the
-usual distance, and F the Student distribution of four degrees of freedom: errors have heavy tails, since what edges
-beside it displace is displaced in all images alike. Segments and the planes that the line lies on tell u together: of
-an edge that all images see from one height, planes know the depth. The fourth is the share of normal residuals of r
-pixels root mean square within the width of an edge, a pixel: chords of curves fit no single line, and where segments of
-a curve are bowed their standard deviations, and with them r, say so.
+like the other. Stripes are shorter than edges: where most lines are stripes, the median length is theirs, and the
+prominence of all lines is too high. By how much, :math:`\delta`, the lines tell together with the share: edges and
+stripes of a scene are, in the mean, as prominent as those of the fit, :math:`\mu_e` and :math:`\mu_t`. The third is the
+probability of an error within :math:`\tau = 0.0025`, where u is the standard deviation across the line that half of its
+places do not exceed, over the usual distance, and F the Student distribution of four degrees of freedom: errors have
+heavy tails, since what edges beside it displace is displaced in all images alike. Segments and the planes that the line
+lies on tell u together: of an edge that all images see from one height, planes know the depth. The fourth is the share
+of normal residuals of r pixels root mean square within the width of an edge, a pixel: chords of curves fit no single
+line, and where segments of a curve are bowed their standard deviations, and with them r, say so.
 
 No quantity depends on the unit of length or on how many pixels an image has. The weights were fitted on rendered scenes
 of boxes and round bodies whose edges are known exactly, and the probabilities compared with those of other scenes
@@ -73,6 +75,11 @@ class ConfidenceGates:
         30.0, "lines", "that the prior on the share of lines with an edge counts for",
         "chosen on the scenes of the fit, each left out in turn",
     )  # fmt: skip
+    edge_prominence: float = gate(3.82, "1", "mean of edges", "measured on the scenes of the fit")
+    stripe_prominence: float = gate(0.25, "1", "median of stripes", "measured on the boxes of the fit")
+    prior_shift: float = gate(
+        300.0, "lines", "that the prior on the shift of prominences counts for", "chosen on rendered scenes"
+    )
     edge_px: float = gate(SEGMENTS.edge, "px", "residual of a segment of a right line", "derived from an edge's width")
     usual_contrast: float = gate(30.0, "1", "of segments whose contrast is unknown", "chosen on the scenes of the fit")
 
@@ -84,6 +91,8 @@ DEFAULT_CONFIDENCE = 0.5
 TOGETHER, NO_TEXTURE = slice(0, 6), slice(6, 8)
 #: Largest logarithm of the odds of an edge, and how often the interval is halved in which they lie (cost: time).
 _MOST_ODDS, _HALVINGS = 40.0, 50
+#: How often the shift of prominences and the share of texture are estimated in turn (cost: time).
+_TURNS = 20
 #: Smallest misfit and spread, below which they say nothing more.
 _MIN_MISFIT, _MIN_SPREAD = 0.3, 1e-4
 #: Shares of an information below which it is none: that of a line, and of the radius beside it (convention: rounding).
@@ -109,11 +118,16 @@ def edge_probability(evidence: FloatArray, weights: FloatArray) -> FloatArray:
     """Return the probability (L,) that there is an edge, from what :func:`line_evidence` returns and its weights.
 
     The lines are all those of a scene. Weights are of log likelihood ratios; the shares of lines whose segments belong
-    together, and of those among them that are no texture, are estimated from the lines.
+    together, and of those among them that are no texture, are estimated from the lines, and so is how much too high
+    their prominences are.
     """
     together, no_texture = (evidence[:, part] @ weights[part] for part in (TOGETHER, NO_TEXTURE))
-    belongs = _with_share(together, np.ones(len(together)))
-    return belongs * _with_share(no_texture, belongs)
+    belongs, shift, edge = _with_share(together, np.ones(len(together))), 0.0, np.ones(len(together))
+    for _ in range(_TURNS):
+        edge = _with_share(no_texture - weights[-1] * shift, belongs)
+        usual = GATES.stripe_prominence + (GATES.edge_prominence - GATES.stripe_prominence) * edge
+        shift = max(float(belongs @ (evidence[:, -1] - usual)) / (GATES.prior_shift + float(belongs.sum())), 0.0)
+    return belongs * edge
 
 
 def _with_share(ratio: FloatArray, count: FloatArray) -> FloatArray:
