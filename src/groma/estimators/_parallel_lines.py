@@ -158,9 +158,9 @@ def _search(pool: Parallel, guesses: FloatArray, wanted: Acceptance) -> _Found:
         if best is None:
             break
         direction, part, factor = best
-        found, share, _, _ = _refined(pool, np.vstack([found, direction]), np.append(share * (1.0 - part), part), False)
+        found, share, _, _ = _fitted(pool, np.vstack([found, direction]), np.append(share * (1.0 - part), part), False)
         evidence.append(factor)
-    found, _, probability, squared = _refined(pool, found, share, True)
+    found, _, probability, squared = _fitted(pool, found, share, True)
     return _Found(found, np.array(evidence), probability, squared)
 
 
@@ -274,7 +274,7 @@ def _refined(
     return (direction, part, evidence) if enough and evidence > -math.log(wanted.max_false_alarms) else None
 
 
-def _refined(
+def _fitted(
     pool: Parallel, vectors: FloatArray, share: FloatArray, with_more: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Directions together: vectors, shares, and (D, N) probabilities and squared residuals of lines along them."""
