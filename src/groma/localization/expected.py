@@ -60,7 +60,7 @@ class FoundAgain:
     def of(scene: Scene, index: MapIndex, near: int) -> FoundAgain:
         """Ask some images of a map what they see of what so many others near them see."""
         count = len(index.image)
-        seen = [np.unique(index.point[index.begin[i] : index.begin[i + 1]]) for i in range(count)]
+        seen = [distinct(index.point[index.begin[i] : index.begin[i + 1]], len(index.xyz))[0] for i in range(count)]
         total = np.bincount(np.concatenate([*seen, np.zeros(0, np.int64)]), minlength=len(index.xyz))
         asked, found = np.ones((2, near + 1)), np.zeros((2, near + 1))
         for image in np.unique(np.linspace(0, count - 1, min(count, _ASKED)).astype(int)).tolist():
@@ -72,9 +72,9 @@ class FoundAgain:
             rows = total[point] - itself[point] >= 2  # points that are in the map without this image
             camera = QueryCamera.of(scene.cameras, int(scene.images.camera_idx[image]))
             rows[rows] = camera.inside(camera.project(scene.cam_from_world[image], index.xyz[point[rows]]))
-            kind = (index.telling[point[rows]] >= ALIKE).astype(np.int64), times[rows]
-            np.add.at(asked, kind, 1.0)
-            np.add.at(found, kind, itself[point[rows]])
+            kind = (index.telling[point[rows]] >= ALIKE) * (near + 1) + times[rows]
+            asked += np.bincount(kind, minlength=asked.size).reshape(asked.shape)
+            found += np.bincount(kind, itself[point[rows]], asked.size).reshape(asked.shape)
         return FoundAgain(found / asked)
 
 
