@@ -115,11 +115,12 @@ def _table(queries: Sequence[PlacedImage]) -> str:
         told = "".join(f"<td>{cell}</td>" for cell in cells)
         words = html.escape(one.sentence)
         rows.append(f'<tr><td class="name">{html.escape(name)}</td>{told}<td class="words">{words}</td></tr>')
+    head = "".join(f"<th>{name}</th>" for name in COLUMNS)
     count = sum(one.status == "localized" for one in queries)
     return (
         '<section class="card wide"><h2>Photographs</h2><p class="caption">'
         f"{count} of {counted(len(queries), 'photographs')} localised. "
         "The images show what of the map was found in each. Standard deviations: of the centre, in units of the map, "
-        f"and of the rotation.</p><table><thead><tr>{''.join(f'<th>{name}</th>' for name in COLUMNS)}<th></th></tr></thead>"
+        f"and of the rotation.</p><table><thead><tr>{head}<th></th></tr></thead>"
         f"<tbody>{''.join(rows)}</tbody></table></section>"
     )
