@@ -115,6 +115,7 @@ def _table(queries: Sequence[StoredImage]) -> str:
         told = "".join(f"<td>{cell}</td>" for cell in cells)
         words = html.escape(one.sentence)
         rows.append(f'<tr><td class="name">{html.escape(name)}</td>{told}<td class="words">{words}</td></tr>')
+    head = "".join(f"<th>{name}</th>" for name in COLUMNS)
     count = sum(one.status == "localized" for one in queries)
     head = "".join(f"<th>{name}</th>" for name in COLUMNS)
     return (
