@@ -75,8 +75,8 @@ class ConfidenceGates:
         30.0, "lines", "that the prior on the share of lines with an edge counts for",
         "chosen on the scenes of the fit, each left out in turn",
     )  # fmt: skip
-    edge_prominence: float = gate(3.82, "1", "mean of edges", "measured on the scenes of the fit")
-    stripe_prominence: float = gate(0.25, "1", "median of stripes", "measured on the boxes of the fit")
+    edge_prominence: float = gate(3.82, "1", "mean of edges", "derived from right lines of the fit")
+    stripe_prominence: float = gate(0.25, "1", "median of stripes", "derived from wrong lines of the fit")
     prior_shift: float = gate(
         300.0, "lines", "that the prior on the shift of prominences counts for", "chosen on rendered scenes"
     )
