@@ -14,6 +14,7 @@ def counted(count: int, plural: str) -> str:
 
 def whole_percent(share: float) -> str:
     """Return a share in whole percents, or that it is less than half a one."""
+    # derived from rounding to whole percents
     return "under 1 %" if 0 < share < 0.005 else f"{100 * share:.0f} %"
 
 
