@@ -45,7 +45,8 @@ def test_a_track_from_waiting_to_finished(tmp_path, scene):
         assert view.state == live.RUNNING
         assert view.scene is None
         (work / "statuses.txt").write_text("")
-        os.utime(work / "statuses.txt", (time.time() - 7500.0,) * 2)
+        then = time.time() - 7500.0
+        os.utime(work / "statuses.txt", (then, then))
         view.refresh()
         assert "Nothing new for 2 h 5 min." in view._words.content
         (work / "frames.txt").write_text(ROW.format(0.0, 0.0, 0) + ROW.format(0.1, 0.5, 0))
