@@ -168,8 +168,7 @@ def map_(
 
     _output.check_outputs(force, output, json_target=console.json_target)
     measured.validate()
-    if not _has_noise(poses, measured.pose_sigma):
-        measured = replace(measured, poses=None)
+    measured = measured if _has_noise(poses, measured.pose_sigma) else replace(measured, poses=None)
     check_inputs(images, model, poses, rig, line_matches, truth, extend, map_images, depth, *measured.files)
     images = _photographs_of(console, images, model)
     maps = _depth.depth_maps(depth, depth_scale, relative_depth, images)
