@@ -6,6 +6,7 @@ The truth is that of scenes that were made; the noise found is compared with the
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from groma.mapping.posed.averaging import average_centers, average_rotations
 from groma.mapping.posed.axes import check_axes
 from groma.mapping.posed.motions import motions_of
 from groma.mapping.posed.noise import noise_of_given
-from groma.mapping.posed.register import averaged
+from groma.mapping.posed.register import averaged, more_seen
 from groma.mapping.posed.sentences import about_contradiction
 from groma.scene import Cameras, Scene
 
@@ -130,8 +131,15 @@ def test_matches_of_sides_that_look_alike_contradict_poses_and_are_told(world):
     rotation, side = scene.cam_from_world[:, :4], np.arange(COUNT) % 4
     seen = quaternion.multiply(rotation, quaternion.exp(np.outer(0.5 * np.pi * side, [0.0, 0.0, 1.0])))
     between = quaternion.multiply(seen[motions.second], quaternion.conjugate(seen[motions.first]))
-    known = averaged(scene, replace(motions, rotation=between))[1]
+    found, known = averaged(scene, replace(motions, rotation=between))
     assert "contradict each other" in " ".join(about_contradiction(known.turn.sigma))
+    # Where more matches meet at the given poses these are kept, at the noise of motions; else the others.
+    for more, kept in ((scene, scene), (found, found)):
+        photographs = SimpleNamespace(
+            triangulate=lambda one, error_px, more=more: SimpleNamespace(point_observations=range(8 + (one is more)))
+        )
+        start, start_noise = more_seen(photographs, scene, found, known, motions)
+        assert start is kept and bool(about_contradiction(start_noise.turn.sigma)) == (kept is found)
     noisy = disturbed(scene, 0.2, 5.0, [], 0)
     assert not about_contradiction(averaged(noisy, motions)[1].turn.sigma) and not about_contradiction(None)
 

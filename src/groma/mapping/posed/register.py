@@ -125,7 +125,7 @@ def register_photographs(
     if not refine_poses:
         say("placing points at the poses", 0, 1)
         return _told(photographs.triangulate(scene, GATES.tolerances_px[-1]), None, near)
-    found, known = averaged(scene, motions)
+    found, known = more_seen(photographs, scene, *averaged(scene, motions), motions)
     rounds = len(GATES.tolerances_px)
     how = AdjustOptions(
         lines=False,
@@ -176,6 +176,25 @@ def averaged(scene: Scene, motions: Motions) -> tuple[Scene, GivenPoses]:
     new = np.hstack([turned.values, -quaternion.rotate(turned.values, placed.values)])
     sigma = (place.sigma or placed.sigma, turn.sigma or turned.sigma)
     return scene.with_poses(new), GivenPoses(poses, place, turn, sigma)
+
+
+def more_seen(
+    photographs: PosedPhotographs, given: Scene, found: Scene, known: GivenPoses, motions: Motions
+) -> tuple[Scene, GivenPoses]:
+    """Return averaged poses, or the given ones if both contradict each other and more matches meet at these.
+
+    Where an object looks alike from several sides most motions can be wrong, and agree with each other.
+    """
+    if not about_contradiction(known.turn.sigma):
+        return found, known
+    seen = [len(photographs.triangulate(one, GATES.tolerances_px[-1]).point_observations) for one in (given, found)]
+    if seen[0] <= seen[1]:
+        return found, known
+    centers = given.cam_centers_in_world
+    apart = float(np.median(np.linalg.norm(centers[motions.first] - centers[motions.second], axis=1)))
+    turn, way = float(np.median(motions.rotation_sigma)), float(np.median(motions.direction_sigma))
+    clean = GivenNoise(None, np.zeros(given.num_images, bool))
+    return given, GivenPoses(known.poses, clean, clean, (apart * way, turn))
 
 
 def _adjusted(scene: Scene, known: GivenPoses, options: AdjustOptions, last: bool) -> tuple[Scene, GivenPoses]:
