@@ -307,8 +307,7 @@ def test_photographs_of_several_sequences_are_where_the_summary_says(place, tmp_
         sources.append({"path": str(tmp_path / f"{number}"), "images": {name: "frame.jpg"}})
     (tmp_path / "map" / "summary.json").write_text(json.dumps({"sources": sources}))
     check_photographs(tmp_path / "map")
-    files = [tmp_path / f"{number}" / "rgb" / "frame.jpg" for number in range(2)]
-    assert Localizer(tmp_path / "map").files == files
+    assert Localizer(tmp_path / "map").files == [tmp_path / f"{one}" / "rgb" / "frame.jpg" for one in range(2)]
     (tmp_path / "1" / "rgb" / "frame.jpg").unlink()
     with pytest.raises(InputError, match="are not in"):
         Localizer(tmp_path / "map")
