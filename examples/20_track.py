@@ -42,11 +42,11 @@ tracker = Tracker(camera)
 for k, pose in enumerate(truth):
     tracked = tracker.process(take(pose, k / 30))
     if k % 8 == 0:
-        print(f"frame {k:2d}: {tracked.status}, agreeing {tracked.counts}")
+        print(f"frame {k:2d}: {tracked.status}, {tracked.counts.get('points', 0)} points agree")
 result = tracker.finish()
 
 error = np.linalg.norm(result.trajectory.world_from_cam[:, 4:] - se3.inverse(truth)[:, 4:], axis=1)
 print(f"Largest position error {1000 * error.max():.1f} mm over {np.linalg.norm(motion[-1, :3]):.2f} m")
 scene = result.scene
-print(f"Map: {scene.num_points} points, {scene.num_lines} lines, {scene.num_planes} plane(s)")
+print(f"Map: {scene.num_points} points, {scene.num_lines} lines, {scene.num_planes} planes")
 print("Plane of the wall (n, w):", np.round(scene.planes.hesse[0], 3))
