@@ -9,7 +9,8 @@ than a plane can hold are resampled to several views (:mod:`groma.mapping.wide_v
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -19,7 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 from groma import cameras as camera_models
-from groma._typing import FloatArray
+from groma._counted import counted
+from groma._typing import BoolArray, FloatArray
 from groma.errors import InputError
 from groma.execution import map_work
 from groma.features.contract import SegmentDetector
@@ -28,6 +30,7 @@ from groma.features.external import ExternalMatches
 from groma.features.images import GrayImage
 from groma.features.segments import Segments
 from groma.gates import gate
+from groma.io.colmap.masks import Masks
 from groma.mapping.photographs import read_gray
 from groma.mapping.wide_views import GATES as WIDE
 from groma.mapping.wide_views import WideDetection, WideViews, parts_inside
@@ -112,26 +115,72 @@ class Straightener:
 
 
 def detect_segments(
-    folder: Path, scene: Scene, detector: SegmentDetector, say: Callable[[str, int, int], None]
+    folder: Path,
+    scene: Scene,
+    detector: SegmentDetector,
+    say: Callable[[str, int, int], None],
+    masks: Masks | None = None,
 ) -> list[Segments]:
-    """Find the segments of every image of a scene; pixels of the images as they are."""
+    """Find the segments of every image of a scene, or of what masks leave of it; pixels of the images as they are."""
     cameras, names, camera_of = scene.cameras, scene.images.names, scene.images.camera_idx
     order = np.argsort(camera_of, kind="stable")  # what resamples a camera's images is made once for all of them
     of_camera = [(name, tuple(cameras.params_of(c).tolist())) for c, name in enumerate(cameras.models)]
-    work = [(folder / names[i], *of_camera[camera_of[i]]) for i in order]
+    work = [(names[i], *of_camera[camera_of[i]]) for i in order]
     try:
-        found = map_work(partial(_detect_in, detector), work, partial(say, "finding segments"))
+        found = map_work(partial(_detect_in, folder, detector, masks), work, partial(say, "finding segments"))
     finally:
         _straightener.cache_clear()
     return [found[place] for place in np.argsort(order)]
 
 
-def _detect_in(detector: SegmentDetector, work: tuple[Path, str, tuple[float, ...]]) -> Segments:
-    """The segments of an image file, whose camera has a model and parameters."""
-    path, model, params = work
-    image = read_gray(path)
-    straightener = _straightener(model, params, image.shape[1], image.shape[0])
-    return detector.detect(image) if straightener is None else straightener.detect(detector, image)
+def _detect_in(
+    folder: Path, detector: SegmentDetector, masks: Masks | None, work: tuple[str, str, tuple[float, ...]]
+) -> Segments:
+    """The segments of an image, whose camera has a model and parameters."""
+    name, model, params = work
+    image = read_gray(folder / name)
+    size = image.shape[1], image.shape[0]
+    straightener = _straightener(model, params, *size)
+    found = detector.detect(image) if straightener is None else straightener.detect(detector, image)
+    used = None if masks is None else masks.read(name, size)
+    return found if used is None else parts_inside(found, partial(_is_used, _without_border(used)))
+
+
+def check_masks(
+    masks: Masks | None, sizes: Mapping[str, tuple[int, int]], say: Callable[[str, int, int], None]
+) -> list[str]:
+    """Say what the masks of photographs of these sizes (width, height) leave out.
+
+    Raises
+    ------
+    InputError
+        If one cannot be read, has other proportions than its photograph, or nothing is left.
+    """
+    if masks is None:
+        return []
+    found = [(name, size) for name, size in sizes.items() if name in masks.file_of]
+    shares = map_work(partial(_share_used, masks), found, partial(say, "checking masks"))
+    if not any(shares) and len(found) == len(sizes):
+        raise InputError(f"The masks in {masks.folder} are all black, and only what is white is used. Turn them round.")
+    rest = f"; {len(sizes) - len(found)} have none" if len(found) < len(sizes) else ""
+    left_out = 100.0 * (1.0 - sum(shares) / max(len(shares), 1))
+    return [f"Masks leave out {left_out:.2g} % of {counted(len(found), 'photographs')}{rest}."]
+
+
+def _share_used(masks: Masks, photograph: tuple[str, tuple[int, int]]) -> float:
+    used = masks.read(*photograph)
+    return 1.0 if used is None else float(used.mean())
+
+
+def _without_border(used: BoolArray) -> BoolArray:
+    """What is used, without its border: the outline of what a mask hides is no edge of the scene."""
+    reach = 2 * math.ceil(WIDE.border) + 1
+    return cv2.erode(used.astype(np.uint8), np.ones((reach, reach), np.uint8)).astype(np.bool_)
+
+
+def _is_used(used: BoolArray, pixels: FloatArray) -> BoolArray:
+    column, row = np.clip(pixels, 0, np.array(used.shape[::-1]) - 1).astype(np.int64).T
+    return np.asarray(used[row, column])
 
 
 # Few are kept: they are larger than the image, and there may be a camera for every image.

@@ -53,7 +53,7 @@ from groma.mapping.checkpoint_files import ADJUSTED, LINE_MAP, SCENE, SEGMENTS
 from groma.mapping.checkpoints import Stages, digest, digest_files, stage
 from groma.mapping.depth.segments import with_line_depths
 from groma.mapping.exchange import NeighborChooser, matches_for, neighbors_for, with_parts
-from groma.mapping.image_segments import detect_segments, given_segments
+from groma.mapping.image_segments import check_masks, detect_segments, given_segments
 from groma.mapping.lines.hypotheses.earlier import GATES as EARLIER
 from groma.mapping.lines.hypotheses.earlier import EarlierMap
 from groma.mapping.lines.in_views import map_lines_in_views
@@ -140,6 +140,7 @@ def map_images(
     read_by_rows(given or Scene(), options, depth)  # refuses depths beside it before anything is computed
     alone = model is None and line_matches is None and not options.rigs
     sizes, copies = checked_photographs(folder, files, given, options.lines.min_images, alone, say)
+    masked = check_masks(options.masks, sizes, say)
     if survey:
         check_survey(survey, tuple(sizes), list(sizes.values()))
     key = digest(__version__, digest_files(folder, files), given)
@@ -162,7 +163,7 @@ def map_images(
         mapped,
         start=base.start,
         num_photographs=len(sizes) if given is None else given.num_images,
-        explanation=" ".join([*registered.notes, mapped.explanation]),
+        explanation=" ".join([*masked, *registered.notes, mapped.explanation]),
         warnings=(*left_out, *not_kept, *registered.warnings, *of_depths, *mapped.warnings),
         surveyed=base.surveyed,
         depths=base.depths,
@@ -301,7 +302,7 @@ def find_segments(
     if not options.refine_poses:
         # Cameras are determined better by places that vary less from view to view, lines by those on the edges.
         detector = CloseEdges(detector)
-    return detect_segments(folder, scene, WithContrast(detector), say)
+    return detect_segments(folder, scene, WithContrast(detector), say, options.masks)
 
 
 def _find_lines(

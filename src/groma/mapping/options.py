@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from groma.adjustment.adjust import AdjustOptions
 from groma.features.contract import ImageRetrieval, SegmentDetector, SegmentMatcher
+from groma.io.colmap.masks import Masks
 from groma.io.colmap.rigs import RigDescription
 from groma.io.colmap.sfm import PointModelOptions
 from groma.mapping.lines.confidence import DEFAULT_CONFIDENCE
@@ -60,6 +61,8 @@ class MapOptions:
     rigs: tuple[RigDescription, ...] = ()
     #: Estimate where cameras sit on their rig.
     refine_rigs: bool = False
+    #: What may be used of the photographs, to find points and segments; None: all.
+    masks: Masks | None = None
     #: What photographs were read along, ``rows`` or ``columns``; None: taken at once, unless a given model says how.
     rolling_shutter: str | None = None
     #: Leave measurements in that the test for gross errors would take out.
@@ -68,7 +71,7 @@ class MapOptions:
     def point_model(self, threads: bool = True) -> PointModelOptions:
         """How points are reconstructed, with or without the number of threads, on which no result depends."""
         lens, count = (self.camera_model or "SIMPLE_RADIAL", self.camera_params), self.threads if threads else None
-        return PointModelOptions(*lens, self.seed, count, self.mapper, self.rigs, self.refine_rigs)
+        return PointModelOptions(*lens, self.seed, count, self.mapper, self.rigs, self.refine_rigs, self.masks)
 
     def adjustment(self, threads: bool = True) -> AdjustOptions:
         """How stages adjust of which the scene alone is wanted: the last one asks what the lenses lack."""

@@ -17,6 +17,7 @@ from groma.compilation.ahead import mapping
 from groma.errors import InputError
 
 if TYPE_CHECKING:
+    from groma.io.colmap.masks import Masks
     from groma.io.colmap.rigs import RigDescription
     from groma.mapping.options import MapOptions
     from groma.scene import Scene
@@ -92,6 +93,13 @@ def map_(
         bool, _options.CAMERAS.option("Estimate the poses of the cameras on the rig.", "--refine-rig/--fix-rig")
     ] = False,
     rolling_shutter: _options.RollingShutter = None,
+    masks: Annotated[
+        Path | None,
+        _options.LANDMARKS.option(
+            "Masks of photographs, as for COLMAP (IMG_1.jpg.png, or IMG_1.png): nothing is found where they are black.",
+            metavar="FOLDER",
+        ),
+    ] = None,
     line_matches: Annotated[
         Path | None,
         _options.LANDMARKS.option(
@@ -169,11 +177,11 @@ def map_(
     _output.check_outputs(force, output, json_target=console.json_target)
     measured.validate()
     measured = measured if _has_noise(poses, measured.pose_sigma) else replace(measured, poses=None)
-    check_inputs(images, model, poses, rig, line_matches, truth, extend, map_images, depth, *measured.files)
+    check_inputs(images, model, poses, rig, line_matches, truth, extend, map_images, depth, masks, *measured.files)
     images = _photographs_of(console, images, model)
     maps = _depth.depth_maps(depth, depth_scale, relative_depth, images)
     known = {"--model": model, "--poses": poses, "--rig": rig, "--camera-params": camera_params, "--depth": depth}
-    check_extension(extend, map_images, known)
+    check_extension(extend, map_images, known | {"--masks": masks})
     _check_start(model, poses, rig)
     placed = model is not None or poses is not None or extend is not None
     refuse_idle(
@@ -211,6 +219,7 @@ def map_(
         mapper=mapper,
         rigs=() if any(given is not None for given in (model, poses, extend)) else _rigs(console, images, rig),
         refine_rigs=refine_rig,
+        masks=_masks_of(masks, images),
         rolling_shutter=rolling_shutter,
         keep_suspects=measured.keep_suspects,
         threads=console.threads,
@@ -219,8 +228,7 @@ def map_(
     refuse_idle(("--refine-rig", refine_rig and not (placed or options.rigs), "with --rig"))
     start, options = _start(console, images, model, poses, options)
     matches = read_matches(line_matches) if line_matches is not None else None
-    true = read_scene(truth) if truth is not None else None
-    work = _output.work_folder(output)
+    true, work = read_scene(truth) if truth is not None else None, _output.work_folder(output)
     photographs, extended = images, None
     if extend is not None:
         stages = stages_of_map(options, "model", bool(measured), matches is not None)
@@ -264,6 +272,12 @@ def _names_in(folder: Path) -> list[str]:
     from groma.mapping.photographs import image_files
 
     return [path.relative_to(folder).as_posix() for path in image_files(folder)]
+
+
+def _masks_of(folder: Path | None, images: Path) -> "Masks | None":
+    from groma.io.colmap.masks import Masks
+
+    return None if folder is None else Masks.of(folder, _names_in(images))
 
 
 def _has_noise(poses: Path | None, stated: str | None) -> bool:

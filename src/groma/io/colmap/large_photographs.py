@@ -19,7 +19,9 @@ from groma.io.colmap.load import opened
 _LARGE = 2000
 
 
-def features_of_large(pycolmap: Any, database: Path, images: Path, names: Sequence[str], extraction: Any) -> list[str]:
+def features_of_large(
+    pycolmap: Any, database: Path, images: Path, names: Sequence[str], extraction: Any, reader: Any
+) -> list[str]:
     """Find the features of those photographs that are large, if they have enough, and return the names of the others.
 
     Parameters
@@ -34,6 +36,8 @@ def features_of_large(pycolmap: Any, database: Path, images: Path, names: Sequen
         Names of the images.
     extraction : pycolmap.FeatureExtractionOptions
         As for all photographs; changed temporarily.
+    reader : pycolmap.ImageReaderOptions
+        Where their masks are.
     """
     with opened(pycolmap, database) as content:
         entered = {name: content.read_image_with_name(name) for name in names}
@@ -49,7 +53,12 @@ def features_of_large(pycolmap: Any, database: Path, images: Path, names: Sequen
     sift = extraction.sift
     sift.first_octave, sift.num_octaves = sift.first_octave + 1, sift.num_octaves - 1
     pycolmap.extract_features(
-        beside, images, image_names=large, extraction_options=extraction, device=pycolmap.Device.cpu
+        beside,
+        images,
+        image_names=large,
+        reader_options=reader,
+        extraction_options=extraction,
+        device=pycolmap.Device.cpu,
     )
     sift.first_octave, sift.num_octaves = sift.first_octave - 1, sift.num_octaves + 1
     enough = set()

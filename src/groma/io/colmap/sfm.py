@@ -27,6 +27,7 @@ from groma.errors import GromaError, InputError, OutputError, did_you_mean
 from groma.io.colmap.large_photographs import features_of_large
 from groma.io.colmap.load import load_pycolmap, opened, quiet
 from groma.io.colmap.mappers import MAPPERS, Task
+from groma.io.colmap.masks import Masks
 from groma.io.colmap.model import from_pycolmap
 from groma.io.colmap.pairs import EXHAUSTIVE_LIMIT, OVERLAP, blocks_of_pairs, places_by_gps
 from groma.io.colmap.rigs import RigDescription, by_frames, camera_of, check_rigs, map_frames
@@ -63,6 +64,8 @@ class PointModelOptions:
     rigs: tuple[RigDescription, ...] = ()
     #: Estimate the poses of the cameras on their rig; otherwise they are held.
     refine_rigs: bool = False
+    #: What may be used of the images; None: all.
+    masks: Masks | None = None
 
     def __post_init__(self) -> None:
         if self.mapper not in MAPPERS:
@@ -272,19 +275,31 @@ def _find_features(
     pycolmap: Any, database: Path, images: Path, names: list[str], options: PointModelOptions, say: Progress
 ) -> None:
     with opened(pycolmap, database) as content:
-        done = {image.name for image in content.read_all_images() if content.exists_descriptors(image.image_id)}
+        entered = content.read_all_images()
+        done = {image.name for image in entered if content.exists_descriptors(image.image_id)}
+        cameras = {camera.camera_id: (camera.width, camera.height) for camera in content.read_all_cameras()}
+    size_of = {image.name: cameras[image.camera_id] for image in entered}
     missing = [name for name in names if name not in done]
-    extraction = pycolmap.FeatureExtractionOptions()
+    extraction, reader = pycolmap.FeatureExtractionOptions(), pycolmap.ImageReaderOptions()
+    if options.masks is not None:
+        reader.mask_path = database.with_name("masks")
     extraction.num_threads = options.threads or -1
     batch = options.threads or os.cpu_count() or 1
     for start in range(0, len(missing), batch):
         say("finding points in images", len(names) - len(missing) + start, len(names))
         wanted = missing[start : start + batch]
         _check_room(database.parent, 2 * len(wanted) * _IMAGE_ROOM)  # large ones are in two databases for a moment
-        wanted = features_of_large(pycolmap, database, images, wanted, extraction)
+        for name in wanted if options.masks is not None else ():
+            options.masks.write(reader.mask_path, name, size_of[name])
+        wanted = features_of_large(pycolmap, database, images, wanted, extraction, reader)
         if wanted:
             pycolmap.extract_features(
-                database, images, image_names=wanted, extraction_options=extraction, device=pycolmap.Device.cpu
+                database,
+                images,
+                image_names=wanted,
+                reader_options=reader,
+                extraction_options=extraction,
+                device=pycolmap.Device.cpu,
             )
 
 
