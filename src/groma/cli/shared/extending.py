@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -103,7 +103,7 @@ def end_queries(output: Path) -> None:
     shutil.rmtree(output.with_name(f"{output.name}.queries"), ignore_errors=True)
 
 
-def check_extension(extend: Path | None, map_images: Path | None, others: dict[str, object]) -> None:
+def check_extension(extend: Path | None, map_images: Path | None, others: Mapping[str, object]) -> None:
     """Refuse options that exclude --extend, or that need it."""
     if extend is None and map_images is not None:
         raise InputError("--map-images tells where the photographs of --extend MAP are. Add --extend, or leave it out.")

@@ -281,7 +281,8 @@ def _find_features(
     size_of = {image.name: cameras[image.camera_id] for image in entered}
     missing = [name for name in names if name not in done]
     extraction, reader = pycolmap.FeatureExtractionOptions(), pycolmap.ImageReaderOptions()
-    if options.masks is not None:
+    masks = options.masks
+    if masks is not None:
         reader.mask_path = database.with_name("masks")
     extraction.num_threads = options.threads or -1
     batch = options.threads or os.cpu_count() or 1
@@ -289,8 +290,9 @@ def _find_features(
         say("finding points in images", len(names) - len(missing) + start, len(names))
         wanted = missing[start : start + batch]
         _check_room(database.parent, 2 * len(wanted) * _IMAGE_ROOM)  # large ones are in two databases for a moment
-        for name in wanted if options.masks is not None else ():
-            options.masks.write(reader.mask_path, name, size_of[name])
+        if masks is not None:
+            for name in wanted:
+                masks.write(reader.mask_path, name, size_of[name])
         wanted = features_of_large(pycolmap, database, images, wanted, extraction, reader)
         if wanted:
             pycolmap.extract_features(
