@@ -135,8 +135,9 @@ def map_images(
         If another run works in ``work``, or it cannot be written.
     """
     say, folder = logged_stages("mapping", progress), Path(images)
+    options = with_parts(options or MapOptions())
     files = image_files(folder)
-    given, near, options = _in_usual_frame(model, with_parts(options or MapOptions()))
+    given, near, options = _in_usual_frame(model, options)
     read_by_rows(given or Scene(), options, depth)  # refuses depths beside it before anything is computed
     alone = model is None and line_matches is None and not options.rigs
     sizes, copies = checked_photographs(folder, files, given, options.lines.min_images, alone, say)
