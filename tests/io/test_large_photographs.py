@@ -45,13 +45,13 @@ def test_enough_features_are_found_without_the_doubled_image(entered):
     (fast, usual), images, extraction = entered
     before = extraction.sift.first_octave, extraction.sift.num_octaves
     with quiet(pycolmap):
-        left = features_of_large(pycolmap, fast, images, NAMES, extraction)
+        left = features_of_large(pycolmap, fast, images, NAMES, extraction, pycolmap.ImageReaderOptions())
         assert left == ["plain.png", "small.png"]  # too little texture; cheap anyway
         assert (extraction.sift.first_octave, extraction.sift.num_octaves) == before
         pycolmap.extract_features(
             usual, images, image_names=["large.png"], extraction_options=extraction, device=pycolmap.Device.cpu
         )
-        assert features_of_large(pycolmap, fast, images, left, extraction) == left
+        assert features_of_large(pycolmap, fast, images, left, extraction, pycolmap.ImageReaderOptions()) == left
     assert [features(fast, name)[0] for name in NAMES] == [True, False, False]
     ours, theirs = features(fast, "large.png")[1], features(usual, "large.png")[1]
     assert len(ours) >= 100 and len(ours) == pytest.approx(len(theirs), rel=0.1)
