@@ -65,7 +65,7 @@ class Command(TyperCommand):
         pieces = ["[OPTIONS]"]
         for one in self.get_params(ctx):
             if one.param_type_name == "argument":
-                name = (one.metavar or one.name) + ("..." if one.nargs != 1 else "")
+                name = (one.metavar or str(one.name)) + ("..." if one.nargs != 1 else "")
                 pieces.append(name if one.required else f"[{name}]")
             elif one.required:
                 pieces.append(f"{min(one.opts, key=len)} {one.metavar}")
@@ -83,7 +83,7 @@ class Command(TyperCommand):
             if record is not None:
                 name, text = record
                 if parameter.param_type_name == "argument":
-                    name = parameter.metavar or parameter.name  # the help says what kind of value
+                    name = parameter.metavar or str(parameter.name)  # the help says what kind of value
                 name = re.sub(r"[<\[]([\w|]+)[>\]]$", r"\1", name)  # choices: one|another
                 sections.setdefault(_heading(parameter), []).append((name, text.replace("-", _HYPHEN)))
         for heading, records in sections.items():
