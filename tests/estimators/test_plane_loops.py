@@ -64,7 +64,7 @@ def test_connected_part_is_that_of_a_graph(seed):
 def test_links_are_as_long_as_is_allowed():
     """Of a row of features those in the middle have their eighth neighbour 4 away: every twelfth is linked by three."""
     features = features_at(np.linspace(0, 120, 121)[:, None] * [1.0, 0.0, 0.0])
-    rows = features.position[24:97:12]
+    rows = features.position[24:97:12].copy()
     mark, part = np.full(121, -1), np.empty(121, np.int64)
     assert (features.spacing[rows] == 4.0).all()
     assert connected_part_loop(*linking(features), rows, rows[:1], 8, 3.0, mark, part)[0] == len(rows)

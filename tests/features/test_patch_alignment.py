@@ -42,7 +42,7 @@ def aligned(images, keypoints, start_error, shape=SHAPE):
     templates = cut_templates(smoothed(first), keypoints)
     count = len(keypoints)
     found = align_templates(
-        smoothed(second), templates, np.arange(count), truth + start_error, np.broadcast_to(shape, (count, 2, 2))
+        smoothed(second), templates, np.arange(count), truth + start_error, np.tile(shape, (count, 1, 1))
     )
     return found, truth
 

@@ -25,6 +25,20 @@ def texture() -> np.ndarray:
     return np.clip(image + 128.0, 0, 255).astype(np.uint8)
 
 
+@pytest.fixture(scope="module")
+def whole(texture) -> sift.Blobs:
+    """What is found in the image as it is."""
+    return sift.find_blobs(texture, 10**6, 0.02)
+
+
+@pytest.fixture(scope="module")
+def in_tiles(texture) -> sift.Blobs:
+    """What is found where the image is too large to be searched at once."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sift, "AT_ONCE", texture.size // 3)
+        return sift.find_blobs(texture, 10**6, 0.02)
+
+
 @pytest.mark.parametrize("blur", [1.5, 3.0, 6.0])
 def test_spots_are_found_where_they_are(blur):
     rng = np.random.default_rng(1)
@@ -37,8 +51,7 @@ def test_spots_are_found_where_they_are(blur):
     np.testing.assert_allclose(np.mean(off, axis=0), 0.0, atol=TOLERANCE)
 
 
-def test_tiles_find_at_the_two_finest_octaves_what_the_whole_image_shows(texture, monkeypatch):
-    whole = sift.find_blobs(texture, 10**6, 0.02)
+def test_tiles_find_at_the_two_finest_octaves_what_the_whole_image_shows(texture, whole, monkeypatch):
     monkeypatch.setattr(sift, "AT_ONCE", texture.size // 3)
     monkeypatch.setattr(sift, "TILE", 256)
     tiled = sift.find_blobs(texture, 10**6, 0.02)
@@ -52,11 +65,8 @@ def test_tiles_find_at_the_two_finest_octaves_what_the_whole_image_shows(texture
             np.testing.assert_array_equal(getattr(other, name), getattr(one, name))
 
 
-def test_the_larger_scales_of_tiled_images_are_about_those_of_the_whole(texture, monkeypatch):
-    whole = sift.find_blobs(texture, 10**6, 0.02)
-    monkeypatch.setattr(sift, "AT_ONCE", texture.size // 3)
-    tiled = sift.find_blobs(texture, 10**6, 0.02)
-    coarse, found = (blobs.take(blobs.octave >= 1) for blobs in (whole, tiled))
+def test_the_larger_scales_of_tiled_images_are_about_those_of_the_whole(whole, in_tiles):
+    coarse, found = (blobs.take(blobs.octave >= 1) for blobs in (whole, in_tiles))
     assert len(coarse) > 50
     distance = np.linalg.norm(coarse.pixels[:, None] - found.pixels, axis=2)
     # A tenth of the blur (a quarter of the diameter) is half of the noise that such points are given.
@@ -65,11 +75,11 @@ def test_the_larger_scales_of_tiled_images_are_about_those_of_the_whole(texture,
     assert np.median(np.abs(np.log(found.size[distance.argmin(axis=1)] / coarse.size))[near]) < 0.02
 
 
-def test_the_strongest_are_kept(texture, monkeypatch):
+def test_the_strongest_are_kept(texture, in_tiles, monkeypatch):
     monkeypatch.setattr(sift, "AT_ONCE", texture.size // 3)
-    every, some = sift.find_blobs(texture, 10**6, 0.02), sift.find_blobs(texture, 100, 0.02)
+    some = sift.find_blobs(texture, 100, 0.02)
     assert len(some) == 100
-    np.testing.assert_array_equal(np.sort(some.response), np.sort(every.response)[-100:])
+    np.testing.assert_array_equal(np.sort(some.response), np.sort(in_tiles.response)[-100:])
 
 
 def test_places_are_described_in_tiles_as_in_the_whole_image(texture, monkeypatch):
