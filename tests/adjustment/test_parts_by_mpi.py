@@ -7,7 +7,7 @@ import signal
 import sys
 
 import pytest
-from _mpi import mpiexec, needs_mpi, same_bytes
+from _mpi import commands, mpiexec, needs_mpi, same_bytes
 
 import groma
 from groma.adjustment.parts import adjust_parts, write_parts
@@ -17,25 +17,43 @@ from groma.solver.options import SolverOptions
 from groma.solver.reduce.mpi import started_as
 
 
-@pytest.fixture
-def parts(tmp_path):
-    write_parts(synthetic.corridor("tiny").start, tmp_path / "parts", observations=400)
-    return tmp_path / "parts"
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("adjusted") / "parts"
+    write_parts(synthetic.corridor("tiny").start, folder, observations=400)
+    return folder
 
 
-def adjust(*arguments):
-    return ["-m", "groma", "adjust", *arguments, "--threads", "1"]
+@pytest.fixture(scope="module")
+def by_two(parts):
+    """A folder, and what two ranks said of five commands in one start.
+
+    Parts in two robust stages; parts that a rank cannot see or has none of; wrong options; other cameras.
+    """
+    home = parts.parent
+    few, mixed = home / "few", home / "mixed"
+    write_parts(groma.read_scene(parts / "part-00000.npz"), few)
+    shutil.copytree(few, mixed)
+    groma.write_scene(synthetic.corridor(13).start, mixed / "part-00001.npz")
+    first = ["adjust", parts, "-o", home / "two", "--json", home / "two.json", "--threads", "1"]
+    same = [
+        ["adjust", few, "-o", home / "y", "--threads", "1", "-v"],
+        ["adjust", mixed, "-o", home / "z", "--loss-scale", "-1", "--loss", "huber"],
+        ["adjust", mixed, "-o", home / "z"],
+    ]
+    seen = [[first, ["adjust", folder, "-o", home / "x"], *same] for folder in (parts, home / "nowhere")]
+    return home, commands(*seen)
 
 
 @needs_mpi
-def test_two_ranks_write_what_one_process_writes(parts, tmp_path):
+def test_two_ranks_write_what_one_process_writes(parts, by_two, tmp_path):
     """Points and lines, in two robust stages."""
     assert run(["adjust", str(parts), "-o", str(tmp_path / "one"), "--threads", "1", "-q"]) == 0
-    said = mpiexec(*[adjust(parts, "-o", tmp_path / "two", "--json", tmp_path / "two.json")] * 2)
-    assert said.returncode == 0, said.stderr
-    assert said.stdout.count("Wrote") == said.stdout.count("steps in") == 1
-    assert same_bytes(tmp_path / "one", tmp_path / "two")
-    numbers = json.loads((tmp_path / "two.json").read_text())
+    home, ((code, said, complaint), *_) = by_two
+    assert code == 0, complaint
+    assert said.count("Wrote") == said.count("steps in") == 1
+    assert same_bytes(tmp_path / "one", home / "two")
+    numbers = json.loads((home / "two.json").read_text())
     assert numbers["ranks"] == 2 and numbers["num_lines"] > 0 and len(numbers["stages"]) == 2
     cameras = groma.read_scene(tmp_path / "one" / "part-00000.npz").num_images
     blocks = cameras + cameras * (cameras - 1) // 2
@@ -62,26 +80,16 @@ def test_a_rank_that_fails_ends_all(parts, tmp_path):
 
 
 @needs_mpi
-def test_what_is_wrong_for_some_rank_is_told_once(parts, tmp_path):
-    """Parts that a rank cannot see or has none of, wrong options, other cameras: four commands in one start."""
-    few, mixed = tmp_path / "few", tmp_path / "mixed"
-    write_parts(groma.read_scene(parts / "part-00000.npz"), few)
-    shutil.copytree(few, mixed)
-    groma.write_scene(synthetic.corridor(13).start, mixed / "part-00001.npz")
-    same = [
-        ["adjust", few, "-o", tmp_path / "y", "--threads", "1", "-v"],
-        ["adjust", mixed, "-o", tmp_path / "z", "--loss-scale", "-1", "--loss", "huber"],
-        ["adjust", mixed, "-o", tmp_path / "z"],
-    ]
-    seen = [[["adjust", folder, "-o", tmp_path / "x"], *same] for folder in (parts, tmp_path / "nowhere")]
-    said = mpiexec(*[[__file__, "commands", json.dumps(commands, default=str)] for commands in seen])
-    assert said.returncode == 0, said.stderr
-    unseen, idle, option, other, _ = said.stderr.split("END ")
+def test_what_is_wrong_for_some_rank_is_told_once(by_two):
+    """Parts that a rank cannot see or has none of, wrong options, other cameras."""
+    home, (_, *others) = by_two
+    codes, _, (unseen, idle, option, other) = zip(*others, strict=True)
+    assert codes == (1, 0, 1, 1)
     assert len(unseen.splitlines()) == 1 and unseen.startswith("groma: Rank 1 of 2: ")
-    assert "that this process can see" in unseen and not (tmp_path / "x").exists()
-    assert idle.splitlines() == ["1", "warning: There are 1 parts for 2 ranks: 1 have nothing to do."]
-    assert option.startswith("0") and len(option.splitlines()) == 2 and "must be a positive number" in option
-    assert other.startswith("1") and len(other.splitlines()) == 2 and "other images or cameras" in other
+    assert "that this process can see" in unseen and not (home / "x").exists()
+    assert idle.splitlines() == ["warning: There are 1 parts for 2 ranks: 1 have nothing to do."]
+    assert len(option.splitlines()) == 1 and "must be a positive number" in option
+    assert len(other.splitlines()) == 1 and "other images or cameras" in other
 
 
 def test_ranks_without_mpi4py_end_and_one_says_why(parts, tmp_path, monkeypatch, capsys):
@@ -127,14 +135,6 @@ if __name__ == "__main__":
     from groma.solver.reduce.mpi import Ranks
 
     ranks = Ranks()
-
-    if sys.argv[1] == "commands":
-        for words in json.loads(sys.argv[2]):
-            code = run(words)
-            ranks.gather("what the others say comes first")
-            if ranks.rank == 0:
-                print(f"END {code}", file=sys.stderr, flush=True)
-        sys.exit(0)
 
     if sys.argv[3:] == ["fail"]:
         import groma.adjustment.parts.run as module

@@ -4,40 +4,50 @@ import sys
 
 import numpy as np
 import pytest
-from _mpi import mpiexec, needs_mpi
+from _mpi import commands, needs_mpi
 
 import groma
 from groma.cli.main import run
 
+SIZES = ["0", "2"]
+
+
+def mapping(corner, cluster_size, output):
+    folder = corner[0]
+    options = ["--model", folder.parent / "model.npz", "--no-diagnosis", "--threads", "1"]
+    return [str(word) for word in ("map", folder, *options, "--cluster-size", cluster_size, "-o", output)]
+
+
+@pytest.fixture(scope="module")
+def by_two(corner, tmp_path_factory):
+    """A folder, and what two ranks said that mapped twice and twice were told what is not there, in one start."""
+    output, (folder, _) = tmp_path_factory.mktemp("ranks"), corner
+    wrong = [
+        ["map", folder.parent / "nowhere", "-o", output / "x"],
+        ["map", folder, "--model", folder.parent / "nowhere.npz", "-o", output / "x"],
+    ]
+    return output, commands(*[[*(mapping(corner, size, output / size) for size in SIZES), *wrong]] * 2)
+
 
 @needs_mpi
-@pytest.mark.parametrize("cluster_size", ["0", "2"])
-def test_ranks_map_what_one_process_maps(corner, tmp_path, cluster_size):
-    folder = corner[0]
-    arguments = ["map", str(folder), "--model", str(folder.parent / "model.npz"), "--no-diagnosis", "--threads", "1"]
-    arguments += ["--cluster-size", cluster_size]
-    assert run([*arguments, "-o", str(tmp_path / "one"), "-q"]) == 0
-    said = mpiexec(*[["-m", "groma", *arguments, "-o", tmp_path / "two"]] * 2)
-    assert said.returncode == 0, said.stderr
-    assert said.stdout.count("Wrote") == 1
-    one, two = (groma.read_scene(tmp_path / name / "scene.npz") for name in ("one", "two"))
+@pytest.mark.parametrize("cluster_size", SIZES)
+def test_ranks_map_what_one_process_maps(corner, by_two, tmp_path, cluster_size):
+    assert run([*mapping(corner, cluster_size, tmp_path / "one"), "-q"]) == 0
+    code, said, complaint = by_two[1][SIZES.index(cluster_size)]
+    assert code == 0, complaint
+    assert said.count("Wrote") == 1
+    one, two = (groma.read_scene(folder / "scene.npz") for folder in (tmp_path / "one", by_two[0] / cluster_size))
     assert one.num_lines > 10
     for table, column in (("lines", "plucker"), ("line_observations", "segment"), ("points", "xyz")):
         np.testing.assert_array_equal(getattr(getattr(two, table), column), getattr(getattr(one, table), column))
 
 
 @needs_mpi
-def test_what_goes_wrong_is_told_once_and_all_end(corner, tmp_path):
-    folder = corner[0]
-    output = ["-o", tmp_path / "x"]
-    for arguments, words in (
-        ([folder.parent / "nowhere", *output], "Cannot read"),
-        ([folder, "--model", folder.parent / "nowhere.npz", *output], "Cannot read"),
-    ):
-        said = mpiexec(*[["-m", "groma", "map", *arguments]] * 2)
-        assert said.returncode == 1
-        assert len(said.stderr.splitlines()) == 1 and words in said.stderr
-    assert not (tmp_path / "x").exists()
+def test_what_goes_wrong_is_told_once_and_all_end(by_two):
+    for code, _, said in by_two[1][len(SIZES) :]:
+        assert code == 1
+        assert len(said.splitlines()) == 1 and "Cannot read" in said
+    assert not (by_two[0] / "x").exists()
 
 
 def test_ranks_without_mpi4py_end_and_one_says_why(corner, tmp_path, monkeypatch, capsys):
