@@ -22,7 +22,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # it keeps a core busy by itself
     os.environ |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
 os.environ.setdefault("GROMA_COMPILE_PROCESSES", "0")
 #: Folders whose files take long, so that no worker is left with one of them at the end of a run.
-LONG = ("tracking", "hostile", "mapping", "viz", "localization", "cli", "adjustment")
+LONG = ("tracking", "hostile", "mapping", "tests", "viz", "localization", "cli", "adjustment")
 
 hypothesis.settings.register_profile(
     "groma",

@@ -96,10 +96,6 @@ checks.check_format("segments", Scene(lines=lines), ["lines"])
 """
 
 
-def test_every_part_keeps_its_contract(python):
-    python("-c", CONFORMANCE)
-
-
 def test_nothing_is_imported_before_it_is_asked_for(python):
     said, _ = python("-c", "import groma, groma.features.registry as r, sys\nprint(r.DETECTORS.names(), *sys.modules)")
     assert said.startswith("['hough', 'lsd', 'onnx:FILE']")
@@ -107,16 +103,12 @@ def test_nothing_is_imported_before_it_is_asked_for(python):
 
 
 ADJUST = """
-import numpy as np
 import groma
-from groma import cameras
 from groma.geometry import quaternion, se3
 from groma.geometry.charts.pose_charts import PoseLeft
-from groma.plugins import load_plugins
-from groma.scene import Cameras, PointObservations, Points, Scene
+from groma.scene import Cameras, PointObservations, Points
 from groma.scene.synthetic.scenes import holistic
 
-load_plugins()
 # Points seen through a lens that groma does not have; the focal length starts 2 % off.
 truth = holistic(8, seed=0).truth
 model, params = cameras.model("EQUISOLID"), np.array([700.0, 512.0, 384.0])
@@ -149,8 +141,9 @@ np.testing.assert_allclose(down, factor.data[0], atol=1e-6)
 """
 
 
-def test_camera_loss_and_factor_take_part_in_adjustments(python):
-    python("-c", ADJUST)
+def test_every_part_keeps_its_contract_and_takes_part_in_adjustments(python):
+    """Of the latter: camera, loss and factor. In one process, which imports everything once."""
+    python("-c", CONFORMANCE + ADJUST)
 
 
 #: Commands, one after the other; each is followed by its exit code on standard error.
@@ -162,7 +155,8 @@ for words in json.loads(sys.argv[1]):
 """
 
 
-def test_loss_chart_solver_and_format_by_name_on_the_command_line(python, tmp_path):
+def test_parts_by_name_on_the_command_line(python, tmp_path):
+    """Loss, chart, solver and format; detector and matcher, by which photographs are mapped."""
     write_scene(holistic(8, seed=0).start, tmp_path / "start.npz")
     options = ["--loss", "welsch", "--loss-scale", "6", "--line-chart", "centimetres", "--no-diagnosis"]
     options += ["--linear-solver", "eigenvalues", "--json", "report.json"]
@@ -170,25 +164,20 @@ def test_loss_chart_solver_and_format_by_name_on_the_command_line(python, tmp_pa
     commands = [["adjust", "start.npz", "-o", "end.npz", *options], ["convert", "end.npz", "end.segments"]]
     commands += [["convert", "end.segments", "lines.npz"], ["convert", "bad.segments", "no.npz"]]
     commands += [["convert", "end.npz", "no.thing"]]
+    write_scene(facade(tmp_path / "photos", 4), tmp_path / "model.npz")
+    options = ["--model", "model.npz", "--no-planes", "--no-diagnosis", "--line-matcher", "nearest"]
+    commands += [["map", "photos", "-o", "out", *options, "--line-detector", "hough"]]
+    commands += [["map", "photos", "-o", "no", *options, "--line-detector", "huff"]]
     _, said = python("-c", COMMANDS, json.dumps(commands))
-    *_, damaged, unknown, last = said.split("END ")
-    assert [part[0] for part in said.split("END ")[1:]] == ["0", "0", "0", "1", "1"] and last == "1\n"
+    *_, damaged, unknown, _, misspelt, last = said.split("END ")
+    assert [part[0] for part in said.split("END ")[1:]] == ["0", "0", "0", "1", "1", "0", "1"] and last == "1\n"
     assert json.loads((tmp_path / "report.json").read_text())["linear_solver"] == "eigenvalues"
     whole, lines = read_scene(tmp_path / "end.npz"), read_scene(tmp_path / "lines.npz")
     np.testing.assert_array_equal(lines.lines.segments, whole.lines.segments)
     assert "not a usable file of segments" in damaged
     assert ".segments for segments as text" in unknown
-
-
-def test_photographs_are_mapped_with_its_detector_and_matcher(python, tmp_path):
-    scene = facade(tmp_path / "photos", 4)
-    write_scene(scene, tmp_path / "model.npz")
-    options = ["--model", "model.npz", "--no-planes", "--no-diagnosis", "--line-matcher", "nearest"]
-    commands = ["map", "photos", "-o", "out", *options, "--line-detector", "hough"], ["map", "photos", "-o", "no"]
-    _, complaint = python("-c", COMMANDS, json.dumps([commands[0], [*commands[1], "--line-detector", "huff"]]))
-    assert complaint.count("END 0") == complaint.count("END 1") == 1
     assert read_scene(tmp_path / "out" / "scene.npz").num_lines > 0
-    assert "There is no segment detector named 'huff'; choose one of hough, lsd, onnx:FILE." in complaint
+    assert "There is no segment detector named 'huff'; choose one of hough, lsd, onnx:FILE." in misspelt
 
 
 BROKEN = "import groma\nraise RuntimeError('made for\\nanother version')\n"

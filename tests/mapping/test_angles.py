@@ -182,11 +182,16 @@ def test_an_uncertain_vector_among_those_that_are_a_little_off_stays_alone():
 # ------------------------------------------------------------------------------------------------------------- Scenes
 @cache
 def walls():
-    """A corridor measured with noise, and its truth."""
-    made = corridor("small", seed=0)
-    plain = made.truth.replace(planes=Planes(), relations=Relations(), directions=Directions())
-    options = groma.AdjustOptions(refine_poses=False, loss="none", max_iterations=15)
-    return made.truth, groma.adjust(plain, options).scene
+    """A corridor measured with noise."""
+    truth = corridor("small", seed=0).truth
+    plain = truth.replace(planes=Planes(), relations=Relations(), directions=Directions())
+    return groma.adjust(plain, groma.AdjustOptions(refine_poses=False, loss="none", max_iterations=15)).scene
+
+
+@cache
+def walls_related():
+    """The same corridor with the structure that is found in it."""
+    return find_structure(walls())
 
 
 def gravity(scene, sigma):
@@ -214,8 +219,7 @@ def off(scene):
 
 
 def test_a_corridor_is_square():
-    _, scene = walls()
-    related = find_structure(scene)
+    related = walls_related()
     kinds = related.relations
     normals = np.abs(related.planes.hesse[:, :3]).argmax(axis=1)
     right, parallel = true_pairs(normals)
@@ -230,8 +234,7 @@ def test_a_corridor_is_square():
 
 @pytest.mark.parametrize("form", ["metric", "pixels"])
 def test_an_adjustment_holds_them_and_planes_come_nearer_to_the_truth(form):
-    _, scene = walls()
-    related = find_structure(scene)
+    related = walls_related()
     options = groma.AdjustOptions(loss="none", structure_form=form)
     bare = related.replace(relations=related.relations.take(**{kind: [] for kind in ANGLES}))
     with_angles, without = (groma.adjust(one, options) for one in (related, bare))
@@ -247,7 +250,7 @@ def test_an_adjustment_holds_them_and_planes_come_nearer_to_the_truth(form):
 
 def test_the_vertical_is_a_direction():
     """Gravity, measured in the cameras: floor and walls are related to it, and it keeps its place."""
-    _, scene = walls()
+    scene = walls()
     level = gravity(scene, 0.002)
     vector, covariance = vertical_of(level)
     assert vector.tolist() == [0.0, 0.0, 1.0]
@@ -272,8 +275,7 @@ def test_the_vertical_is_a_direction():
 
 
 def test_files_and_selections_keep_them(tmp_path):
-    _, scene = walls()
-    related = find_structure(scene)
+    related = walls_related()
     write_archive(related, tmp_path / "scene.npz")
     read = read_archive(tmp_path / "scene.npz").relations
     for kind in ANGLES:

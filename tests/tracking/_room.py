@@ -47,8 +47,8 @@ def _rendered(pose: bytes) -> tuple[np.ndarray, np.ndarray]:
     cam_from_world = np.frombuffer(pose)
     world = se3.inverse(cam_from_world[None])[0]
     R = quaternion.to_matrix(world[:4])
-    v, u = np.mgrid[0:HEIGHT, 0:WIDTH]
-    x, y = (u + 0.5 - WIDTH / 2) / FOCAL, (v + 0.5 - HEIGHT / 2) / FOCAL
+    x = (np.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL
+    y = ((np.arange(HEIGHT) + 0.5 - HEIGHT / 2) / FOCAL)[:, None]
     along = [row[0] * x + row[1] * y + row[2] for row in R]
     with np.errstate(divide="ignore"):
         distance = [(np.copysign(ROOM[k], along[k]) - world[4 + k]) / along[k] for k in range(3)]
