@@ -34,9 +34,19 @@ def trees() -> dict[str, ast.Module]:
     return {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in MODULES.items()}
 
 
-def imported(tree: ast.AST) -> Iterator[str]:
+def statements_in(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield what is in a module or statement but no expression: these are most of a tree, and hold no statement."""
+    for child in ast.iter_child_nodes(node):
+        if not isinstance(child, ast.expr):
+            yield child
+
+
+def imported(node: ast.AST) -> Iterator[str]:
     """Yield full names of what a module of groma imports from groma: modules, and names in them."""
-    for node in ast.walk(tree):
+    parts = [node]
+    while parts:
+        node = parts.pop()
+        parts += statements_in(node)
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names if alias.name.split(".")[0] == "groma")
         elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "groma":
@@ -55,7 +65,7 @@ def owner_of(name: str) -> str | None:
 
 def functions(tree: ast.AST, signature: bool = True, prefix: str = "") -> Iterator[tuple[str, int]]:
     """Yield names of functions and their number of lines, without decorators and docstring."""
-    for node in ast.iter_child_nodes(tree):
+    for node in statements_in(tree):
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
             assert node.end_lineno is not None
             lines = node.end_lineno - (node.lineno if signature else node.body[0].lineno) + 1
@@ -92,7 +102,7 @@ def test_owners_are_told():
 
 def imported_when_run(node: ast.AST) -> Iterator[str]:
     """Yield what a module imports from groma, in functions too, except what only type checkers read."""
-    for child in ast.iter_child_nodes(node):
+    for child in statements_in(node):
         if isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING":
             continue
         yield from imported(child) if isinstance(child, (ast.Import, ast.ImportFrom)) else imported_when_run(child)
