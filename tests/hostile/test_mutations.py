@@ -32,7 +32,7 @@ import os, signal, sys, time
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 import _runner, _targets
-_runner.SECONDS = 2  # of the processor
+_runner.SECONDS = 1  # of the processor
 
 def broken(folder):
     number = int((folder / "n").read_bytes()[:1] or b"0")

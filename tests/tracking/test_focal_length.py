@@ -17,8 +17,8 @@ from groma.tracking import Tracker, TrackOptions
 def test_a_wrong_focal_length_is_told_where_the_camera_turns(kind, count, turn, step, factor, turns, told):
     camera = _room.camera(_room.BASELINE if kind == "stereo" else None)
     given = replace(camera, params=camera.params * np.array([factor, factor, 1.0, 1.0]))
-    few = {"num_points": 250, "num_features": 500, "lines": False} if kind == "stereo" else {}
-    tracker = Tracker(given, TrackOptions(threaded=False, **few))
+    few = {"num_points": 250, "num_features": 500} if kind == "stereo" else {}
+    tracker = Tracker(given, TrackOptions(threaded=False, lines=False, **few))
     for frame in _room.frames(kind, _room.poses(count, turn=turn * turns, step=step)):
         tracker.process(frame)
     assert any("focal length" in warning for warning in tracker.finish().warnings) == told
