@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,7 @@ needs_mpi = pytest.mark.skipif(
 )
 
 
-def mpiexec(*ranks: list[object]) -> subprocess.CompletedProcess[str]:
+def mpiexec(*ranks: Sequence[object]) -> subprocess.CompletedProcess[str]:
     """Run one process of Python per list of arguments, all together."""
     command = [str(MPIEXEC)]
     for number, arguments in enumerate(ranks):
@@ -28,12 +29,12 @@ def mpiexec(*ranks: list[object]) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=environment)
 
 
-def commands(*ranks: list[list[object]]) -> list[tuple[int, str, str]]:
+def commands(*ranks: Sequence[Sequence[object]]) -> list[tuple[int, str, str]]:
     """Run commands of groma in one start, a list of them per rank; return exit code and both streams of each."""
     said = mpiexec(*[[__file__, json.dumps(words, default=str)] for words in ranks])
     assert said.returncode == 0, said.stderr
     (*out, _), (*err, _) = (re.split(r"END (\d)\n", stream) for stream in (said.stdout, said.stderr))
-    return [(int(code), *texts) for code, *texts in zip(err[1::2], out[::2], err[::2], strict=True)]
+    return [(int(code), *texts) for code, texts in zip(err[1::2], zip(out[::2], err[::2], strict=True), strict=True)]
 
 
 def same_bytes(first: Path, second: Path) -> bool:
