@@ -46,11 +46,6 @@ def test_the_viewer_is_loaded_only_when_asked_for():
     assert "viser" not in _loaded_after("import groma\ngroma.adjust\ngroma.read_scene")
 
 
-@pytest.mark.parametrize("module", ["groma.adjustment.adjust", "groma.mapping.map"])
-def test_statistics_are_not_loaded_for_a_quantile(module):
-    assert "scipy.stats" not in _loaded_after(f"import {module}")
-
-
 def test_special_functions_are_loaded_when_a_map_needs_them():
     """They bring a hundred modules along; by then other threads look for segments."""
     loaded = _loaded_after("from groma.cli.app import app\nimport groma.mapping.map")
