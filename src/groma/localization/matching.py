@@ -86,10 +86,10 @@ def _near(
     count = 0
     for i in range(expected.shape[0]):
         u, v, own = expected[i, 0], expected[i, 1], rows_of_first[i]
-        column, row = int(np.floor(u / side)) + 1, int(np.floor(v / side)) + 1
-        right = max(min(column + 2, cells[0]), 0)
-        left = min(max(column - 1, 0), right)
-        for y in range(max(row - 1, 0), min(row + 2, cells[1])):
+        right = max(min(int(np.floor((u + reach) / side)) + 2, cells[0]), 0)
+        left = min(max(int(np.floor((u - reach) / side)) + 1, 0), right)
+        top, bottom = int(np.floor((v - reach) / side)) + 1, int(np.floor((v + reach) / side)) + 2
+        for y in range(max(top, 0), min(bottom, cells[1])):
             for at in range(cell_begin[y * cells[0] + left], cell_begin[y * cells[0] + right]):
                 k = cell_point[at]
                 if (pixels[k, 0] - u) ** 2 + (pixels[k, 1] - v) ** 2 > reach * reach:

@@ -27,7 +27,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from groma._numba import unrolled_loop
+from groma._numba import loop
 from groma._rows import pointers_of
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import assemble
@@ -54,27 +54,22 @@ GATES = CommonErrorGates()
 
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
-@unrolled_loop
+@loop
 def _pull_views(begin, seen, motion, landmarks, by_landmark, first_camera, K):
-    """Add to K what landmarks (n,) do that pull (n, d, m) at a query, view by view of the map."""
+    """Add to K what landmarks (n,) do that pull (n, d, m) at a query, view by view of the map; m is three or six."""
     parameters, size = motion.shape[2] - 6, motion.shape[1]
-    moved = np.empty(motion.shape[2])
     for n in range(landmarks.shape[0]):
         if landmarks[n] >= begin.shape[0] - 1:
             continue
+        pull = by_landmark[n]
         for row in range(begin[landmarks[n]], begin[landmarks[n] + 1]):
             frame, camera = 6 * seen[row, 1], first_camera + parameters * seen[row, 2]
-            for i in range(by_landmark.shape[1]):
+            for k in range(0, size, 3):
                 for j in range(motion.shape[2]):
-                    moved[j] = 0.0
-                for k in range(size):
-                    factor = by_landmark[n, i, k]
-                    for j in range(motion.shape[2]):
-                        moved[j] += factor * motion[row, k, j]
-                for j in range(6):
-                    K[frame + j, i] += moved[j]
-                for j in range(parameters):
-                    K[camera + j, i] += moved[6 + j]
+                    place = frame + j if j < 6 else camera + j - 6
+                    x, y, z = motion[row, k, j], motion[row, k + 1, j], motion[row, k + 2, j]
+                    for i in range(pull.shape[0]):
+                        K[place, i] += pull[i, k] * x + pull[i, k + 1] * y + pull[i, k + 2] * z
 
 
 # ----------------------------------------------------------------------------------------------------------- Public

@@ -308,8 +308,7 @@ def _unless_mirrored(
 
     Some of its points are matched first: mostly far too few of them agree with any pose.
     """
-    points = matches.take(np.ones(matches.num_points, bool), np.zeros(matches.num_lines, bool))
-    agree = len(np.unique(cells_of(points.points2d, here.own.camera, VERDICT.cells)[here.own.point_inliers]))
+    agree = len(np.unique(cells_of(matches.points2d, here.own.camera, VERDICT.cells)[here.own.point_inliers]))
     wanted = votes_of_a_rival(agree)
     parts = [(step, votes_of_a_part(wanted, 1.0 / step)) for step in _SOME]
     step, votes = next((one for one in parts if one[1] >= _VOTES), parts[-1])

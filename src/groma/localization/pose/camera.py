@@ -12,7 +12,7 @@ from groma import cameras
 from groma._typing import FloatArray
 from groma.cameras import CameraModel
 from groma.errors import InputError
-from groma.geometry import se3
+from groma.geometry.charts.pose_charts import POSE_CHARTS
 from groma.scene import Cameras
 
 
@@ -65,8 +65,7 @@ class QueryCamera:
 
     def project(self, cam_from_world: FloatArray, points: FloatArray) -> FloatArray:
         """Pixels (N, 2) of points in the world; NaN behind the camera and where the model has none."""
-        R_t = se3.to_matrix(cam_from_world[None])[0]
-        inside = points @ R_t[:3, :3].T + R_t[:3, 3]
+        inside = seen_from(cam_from_world, points)
         pixels = self.kind.project(self.params, np.ascontiguousarray(inside))
         if not self.kind.sees_behind:
             pixels[inside[:, 2] <= 0.0] = np.nan
@@ -86,3 +85,14 @@ class QueryCamera:
     def of(table: Cameras, row: int) -> QueryCamera:
         """One camera of a scene."""
         return QueryCamera(table.models[row], table.params_of(row), int(table.width[row]), int(table.height[row]))
+
+
+def motion_of(cam_from_world: FloatArray) -> FloatArray:
+    """Matrix [R | t] (3, 4) of one pose (7,)."""
+    return POSE_CHARTS["left"].ambient(cam_from_world[None]).reshape(3, 4)
+
+
+def seen_from(cam_from_world: FloatArray, points: FloatArray) -> FloatArray:
+    """Points (..., 3) of the world as a camera with this pose (7,) has them."""
+    R_t = motion_of(cam_from_world)
+    return points @ R_t[:, :3].T + R_t[:, 3]

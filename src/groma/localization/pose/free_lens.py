@@ -62,7 +62,7 @@ class FreeLens:
 
     def moved(self, params: FloatArray, step: FloatArray) -> FloatArray:
         """Parameters after a step (k,), which is cut off where it is large."""
-        step, found = np.clip(step, -_FARTHEST, _FARTHEST), params.copy()
+        step, found = np.minimum(np.maximum(step, -_FARTHEST), _FARTHEST), params.copy()
         first, number = 1 + len(self.center), 1 + len(self.center) + len(self.distortion)
         found[self.center] += step[1:first] * params[self.focal].mean()
         found[self.distortion] += step[first:number]
@@ -75,6 +75,8 @@ class FreeLens:
         """Products (7 + k, 7 + k) of the derivatives and residuals of the priors, as of some more measurements."""
         count = len(self.center)
         record = np.zeros((count + self.shape, 8 + count + len(self.distortion) + self.shape))
+        if not self.shape and not np.isfinite(self.sigma):
+            return np.zeros((record.shape[1],) * 2)
         at = np.arange(count)
         record[at, 7 + at] = params[self.focal].mean() / self.sigma
         record[:count, -1] = (params[self.center] - self.expected) / self.sigma

@@ -38,11 +38,7 @@ def straightened(camera: QueryCamera, matches: Matches) -> Straight:
     segments = camera.straight(matches.segments2d).reshape(-1, 2, 2)
     good: BoolArray = np.isfinite(points.sum(axis=1))
     good_lines: BoolArray = np.isfinite(segments.sum(axis=(1, 2)))
-    kept = matches.take(good, good_lines)
-    moved = Matches(
-        points[good], kept.points3d, segments[good_lines], kept.segments3d,
-        kept.point_sigma, kept.segment_sigma, kept.point_covariance, kept.line_covariance,
-    )  # fmt: skip
+    moved = Matches(points[good], matches.points3d[good], segments[good_lines], matches.segments3d[good_lines])
     K = camera.matrix
     pinhole = {
         "model": "PINHOLE", "width": camera.width, "height": camera.height,

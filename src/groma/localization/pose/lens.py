@@ -20,12 +20,14 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.factors.losses import Cauchy
 from groma.gates import gate
-from groma.localization.pose.free_lens import free_lens
+from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.free_lens import FreeLens, free_lens
 from groma.localization.pose.gates import REFINEMENT, VERDICT, VerdictGates
 from groma.localization.pose.matches import Matches
+from groma.localization.pose.one_pose import OnePose
 from groma.localization.pose.pose_fit import full_step
 from groma.localization.pose.pose_problem import problem_of
-from groma.localization.pose.refinement import Refined, fitted_at, refine, weighed
+from groma.localization.pose.refinement import Refined, fit_to_near, fitted_at, weighed
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class LensStep:
     focal: float
     focal_sigma: float
     #: How far the principal point moves if it is estimated, too, focal lengths; and the squared step of both in units
-    #: of their covariance. Zero where one step says that it is near, or nothing determines it.
+    #: of their covariance. Zero where it is near, or nothing determines it.
     shift: float = 0.0
     square: float = 0.0
 
@@ -91,27 +93,33 @@ def lens_step(
     each = -(-(matches.num_points + matches.num_lines) // GATES.matches)
     some = matches.take(np.arange(0, matches.num_points, each), np.arange(0, matches.num_lines, each))
 
-    def covariance(found: Refined) -> FloatArray:
+    def fitted(lens: FreeLens | None) -> tuple[OnePose, QueryCamera]:
+        return fit_to_near(refined.camera, some, refined.pose, max_error, lens, gathered)
+
+    def covariance(one: OnePose, camera: QueryCamera, lens: FreeLens | None) -> FloatArray:
         """That of what was estimated of a lens."""
+        found = fitted_at(one, camera, some, max_error, lens)
         joint = found.joint_covariance(some)
         if common is not None and np.isfinite(joint).all():
             joint = joint + common(found, matches, each)
         return joint[6:, 6:]
 
-    found = refine(refined.camera, some, refined.pose, max_error, free_lens(refined.camera, "focal"), gathered)
-    focal, sigma = float(_step(refined, found)[0]), np.inf
+    lens, whole = (free_lens(refined.camera, unknowns) for unknowns in ("focal", "pinhole"))
+    one, camera = fitted(lens)
+    focal, sigma = float(_step(refined.camera, camera)[0]), np.inf
     if abs(focal) > gates.focal:
-        sigma = float(np.sqrt(covariance(found)[0, 0]))
-    points, whole = refined.camera.kind.principal_point_indices, free_lens(refined.camera, "pinhole")
-    here = fitted_at(found.one, found.camera, some, max_error, whole)
-    if not gathered or not points or not _may_be_far(here, 0.5 * gates.shift):
+        sigma = float(np.sqrt(covariance(one, camera, lens)[0, 0]))
+    if not gathered or not camera.kind.principal_point_indices:
         return LensStep(focal, sigma)
-    found = refine(refined.camera, some, refined.pose, max_error, whole, gathered)
-    step, uncertain = _step(refined, found), covariance(found)
+    if not _may_be_far(fitted_at(one, camera, some, max_error, whole), 0.5 * gates.shift):
+        return LensStep(focal, sigma)
+    one, camera = fitted(whole)
+    step = _step(refined.camera, camera)
+    shift = float(np.linalg.norm(step[1:]))
+    uncertain = covariance(one, camera, whole) if shift > gates.shift else np.full((3, 3), np.inf)
     if not np.isfinite(uncertain).all():
         return LensStep(focal, sigma)
-    square = float(step @ np.linalg.solve(uncertain, step))
-    return LensStep(focal, sigma, float(np.linalg.norm(step[1:])), square)
+    return LensStep(focal, sigma, shift, float(step @ np.linalg.solve(uncertain, step)))
 
 
 def _one_step(refined: Refined, matches: Matches) -> tuple[float, float]:
@@ -125,12 +133,11 @@ def _one_step(refined: Refined, matches: Matches) -> tuple[float, float]:
     return (np.inf, np.inf) if step is None else (float(step[6]), float(np.linalg.norm(step[7:])))
 
 
-def _step(given: Refined, found: Refined) -> FloatArray:
+def _step(given: QueryCamera, found: QueryCamera) -> FloatArray:
     """Steps (3,) of focal length and principal point, from those of the lens that was given."""
-    kind, params = found.camera.kind, given.camera.params
-    focal = kind.focal_length(params)
-    center = (found.camera.params - params)[list(kind.principal_point_indices)] / focal
-    return np.append(np.log(kind.focal_length(found.camera.params) / focal), center)
+    kind, focal = found.kind, found.kind.focal_length(given.params)
+    center = (found.params - given.params)[list(kind.principal_point_indices)] / focal
+    return np.append(np.log(kind.focal_length(found.params) / focal), center)
 
 
 def _may_be_far(here: Refined, limit: float) -> bool:

@@ -37,8 +37,7 @@ from groma._numba import loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.factors.losses import Cauchy, GemanMcClure
 from groma.gates import NORMAL, chi_square_gate
-from groma.geometry import se3
-from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.camera import QueryCamera, seen_from
 from groma.localization.pose.free_lens import FreeLens
 from groma.localization.pose.gates import REFINEMENT
 from groma.localization.pose.matches import Matches, nearest_claims
@@ -149,7 +148,7 @@ class Refined:
             return np.full((J.shape[2], J.shape[2]), np.inf)
         root = sigma * vectors / np.sqrt(values) / scale[:, None]
         count, dof = int(cell.max()) + 1, len(scale)
-        pulled = (pull[:, None, :] @ J)[:, 0] @ (root / sigma**2)
+        pulled = (pull[:, :1] * J[:, 0] + pull[:, 1:] * J[:, 1]) @ (root / sigma**2)
         gradient = np.stack([np.bincount(cell, column, count) for column in pulled.T], axis=1)
         if count > dof:
             shared, axes = np.linalg.eigh(gradient.T @ gradient * (count / (count - dof)))
@@ -227,6 +226,19 @@ def refine(
     gathered
         The matches were looked for near the start, as far as it may be off: all of them are near at first.
     """
+    one, estimated = fit_to_near(camera, matches, start, max_error, lens, gathered)
+    return fitted_at(one, estimated, matches, max_error, lens)
+
+
+def fit_to_near(
+    camera: QueryCamera,
+    matches: Matches,
+    start: FloatArray,
+    max_error: tuple[float, float],
+    lens: FreeLens | None = None,
+    gathered: bool = False,
+) -> tuple[OnePose, QueryCamera]:
+    """Fit a pose as :func:`refine` does, without asking what agrees with it."""
     one = problem_of(camera, matches, start, lens is not None)
     limits = [
         (error / sigma) ** 2
@@ -246,7 +258,7 @@ def refine(
         camera, one = estimated, moved
         if last:
             break
-    return fitted_at(one, camera, matches, max_error, lens)
+    return one, camera
 
 
 def _agreeing(squares: tuple[FloatArray, FloatArray]) -> int:
@@ -297,8 +309,7 @@ def _in_front(camera: QueryCamera, matches: Matches, pose: FloatArray) -> BoolAr
     """
     if not matches.num_lines:
         return np.zeros(0, bool)
-    R_t = se3.to_matrix(pose[None])[0]
-    ends = matches.segments3d @ R_t[:3, :3].T + R_t[:3, 3]
+    ends = seen_from(pose, matches.segments3d)
     start, way = ends[:, 0], ends[:, 1] - ends[:, 0]
     ray = camera.kind.unproject(camera.params, np.ascontiguousarray(matches.segments2d.mean(axis=1)))
     along = np.einsum("ni,ni->n", way, ray)

@@ -52,8 +52,7 @@ import numpy as np
 from groma._counted import counted
 from groma._typing import BoolArray, FloatArray
 from groma.gates import chi_square_gate
-from groma.geometry import se3
-from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.camera import QueryCamera, seen_from
 from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.lens import LensStep
 from groma.localization.pose.matches import Matches
@@ -308,8 +307,7 @@ def moved(camera: QueryCamera, first: FloatArray, second: FloatArray, places: Fl
 
 def median_distance(pose: FloatArray, places: FloatArray) -> float:
     """Median distance (scene units) of places in the world from a camera."""
-    R_t = se3.to_matrix(pose[None])[0]
-    return float(np.median(np.linalg.norm(places @ R_t[:3, :3].T + R_t[:3, 3], axis=1))) if len(places) else 0.0
+    return float(np.median(np.linalg.norm(seen_from(pose, places), axis=1))) if len(places) else 0.0
 
 
 def _crowding(refined: Refined, matches: Matches) -> float:
