@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Keyframes: each is another frame, whatever failed on the way; described features in all parts of an image."""
 
+from dataclasses import replace
+
 import _room
 import numpy as np
 import pytest
@@ -8,6 +10,8 @@ import pytest
 from groma._stopwatch import Stopwatch
 from groma.geometry import se3
 from groma.tracking import Tracker, TrackOptions
+from groma.tracking.backend.local_adjustment import window_job
+from groma.tracking.backend.loop_closure import LoopSearch
 from groma.tracking.backend.mapper import Mapper
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.features import Features, describe
@@ -70,6 +74,43 @@ def test_what_is_worked_out_is_taken_up_before_a_frame_is_searched():
     assert len(tracker.map.keyframes) == made
     assert not mapper.busy
     tracker.finish()
+
+
+def test_a_window_is_adjusted_until_noise_moves_its_cost_as_much():
+    """The next keyframe's window goes on; what is left open is less than noise leaves of a cost."""
+    tracker = Tracker(_room.camera(), OPTIONS)
+    for frame in _room.frames("rgbd", _wide(8)):
+        tracker.process(frame)
+    track_map = tracker.map
+    track_map.last.pose[4:] += 0.05
+    window = window_job(track_map, tracker.camera, OPTIONS.window, OPTIONS.relations, metric=True)
+    assert window is not None
+    whole = replace(window, function_tolerance=1e-3)
+    reports = []
+    for job in (window, whole):
+        job.solve()
+        assert job.report is not None
+        reports.append(job.report)
+    tracker.finish()
+    ended, converged = reports
+    assert ended.iterations < converged.iterations
+    left = ended.final_cost - converged.final_cost
+    deviation = np.sqrt(0.5 * (ended.num_residuals - ended.num_unknowns))
+    assert left < deviation < 0.1 * ended.initial_cost
+
+
+def test_keyframes_are_compared_by_what_stands_out_in_both():
+    bits = np.random.default_rng(0).integers(0, 256, (300, 32)).astype(np.uint8)
+    gates = replace(OPTIONS.gates, loops=replace(OPTIONS.gates.loops, voters=100, searched=1, min_matches=1))
+
+    def seen(index: int, strength: np.ndarray) -> Keyframe:
+        features = replace(Features.none(), descriptor=bits, response=strength)
+        gray = np.zeros((1, 1), np.uint8)
+        return Keyframe(index, 0.0, "", se3.identity(), gray, Measurements.empty(), features, np.zeros(1))
+
+    strong, weak = np.arange(300.0), -np.arange(300.0)
+    found = LoopSearch(seen(2, strong), [seen(0, weak), seen(1, strong)], gates).run()
+    assert [(keyframe.index, len(first)) for keyframe, first, _ in found] == [(1, 300)]
 
 
 @pytest.mark.parametrize(("rate", "frames"), [(10.0, 2), (30.0, 3), (60.0, 4)])

@@ -32,6 +32,9 @@ from groma.tracking.pose.estimate import GATE
 
 #: Keyframes outside the window that are held as its border.
 BORDER = 8
+#: A window is done where a step lowers its cost by less than this share: the next keyframe's goes on from there (cost:
+#: iterations; noise alone moves the cost of a window by 2 %).
+WINDOW_TOLERANCE = 0.01
 #: Lower bound of the estimated noise of columns in right images, of the stated one.
 LEAST_NOISE = 0.05
 
@@ -178,7 +181,8 @@ def window_job(
         held[0] = True
         if not metric and len(held) > 2:
             held[1] = True
-    return job_of(track_map, camera, border + window, held, relations)
+    job = job_of(track_map, camera, border + window, held, relations)
+    return job and replace(job, function_tolerance=WINDOW_TOLERANCE)
 
 
 def job_of(
