@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Two directives that look for what there is.
 
-``package-reference``: one section per public module of a package. ``short-names``: the names of :mod:`groma` itself, one
+``package-reference``: one section per public module of a package. ``short-names``: the names of :mod:`groma` itself, a
 table per package, each with its first sentence and a link to its documentation there.
 """
 
@@ -51,7 +51,7 @@ class PackageReference(SphinxDirective):
 
 
 class ShortNames(SphinxDirective):
-    """Tables of the names of groma: what is documented elsewhere can be referred to, and searched, by its short name."""
+    """Tables of the names of groma: what is documented elsewhere can be searched by its short name."""
 
     def run(self) -> list[nodes.Node]:
         """Build the tables."""
