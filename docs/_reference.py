@@ -56,7 +56,7 @@ class ShortNames(SphinxDirective):
     def run(self) -> list[nodes.Node]:
         """Build the tables."""
         rooms: dict[str, list[str]] = defaultdict(list)
-        for name in groma.__all__:
+        for name in vars(groma)["__all__"]:
             if not inspect.ismodule(value := getattr(groma, name)):
                 rooms[value.__module__.split(".")[1]].append(name)
         return [self._section(room, rooms[room]) for room in sorted(rooms)]
