@@ -393,12 +393,6 @@ def test_queries_that_are_not_there_and_bad_maps_end_in_one_line(place, tmp_path
         assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_an_exchanged_map_is_named(tmp_path, capsys):
-    (tmp_path / "map.npz").touch()
-    assert run(["localize", str(tmp_path), str(tmp_path / "map.npz"), "-o", str(tmp_path / "out")]) == 1
-    assert f"groma localize {tmp_path / 'map.npz'} {tmp_path} -o" in capsys.readouterr().err
-
-
 def test_options_without_lines_use_none(place):
     found = Localizer(place / "map.npz", place / "images", options=LocalizeOptions(lines=False))
     pose = found.localize(place / "queries" / QUERIES[3]).pose
