@@ -312,3 +312,9 @@ def test_synth_is_repeatable(here, capsys):
 def test_report(scenes, here):
     assert run(["report", str(scenes / "truth.npz"), "--before", str(scenes / "start.npz"), "-o", "p.html"]) == 0
     assert "<!doctype html>" in (here / "p.html").read_text()
+
+
+def test_an_exchanged_map_is_named(tmp_path, capsys):
+    (tmp_path / "map.npz").touch()
+    assert run(["localize", str(tmp_path), str(tmp_path / "map.npz"), "-o", str(tmp_path / "out")]) == 1
+    assert f"groma localize {tmp_path / 'map.npz'} {tmp_path} -o" in capsys.readouterr().err

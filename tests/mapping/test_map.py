@@ -17,7 +17,7 @@ from groma.evaluation.poses import evaluate_poses
 from groma.features.external import ExternalMatches, write_matches
 from groma.features.lsd import LsdDetector
 from groma.features.matches import LineMatches
-from groma.io import read_scene
+from groma.io import read_scene, write_scene
 from groma.io.colmap.sfm import PointModelOptions
 from groma.mapping import map as mapping
 from groma.mapping.map import map_images
@@ -43,6 +43,9 @@ def test_bad_input_is_refused_in_one_sentence(tmp_path, model):
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="holds no images"):
         map_images(tmp_path / "empty", tmp_path / "work", model)
+    write_scene(model, tmp_path / "model")
+    with pytest.raises(InputError, match="holds a model, but no images"):
+        map_images(tmp_path / "model", tmp_path / "work")
     cv2.imwrite(str(tmp_path / "empty" / "a.png"), np.zeros((10, 10), np.uint8))
     with pytest.raises(InputError, match=r"None of the .* images of the model is in"):
         map_images(tmp_path / "empty", tmp_path / "work", model)

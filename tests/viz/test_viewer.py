@@ -321,7 +321,8 @@ def test_command_refuses_in_one_line(tmp_path, capsys):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX systems")
-def test_ctrl_c_ends_it(tmp_path):
+@pytest.mark.parametrize("signals", [[signal.SIGINT], [signal.SIGTERM, signal.SIGINT]])
+def test_ctrl_c_ends_it(tmp_path, signals):
     write_scene(exact_scene(), tmp_path / "scene.npz")
     process = subprocess.Popen(
         [sys.executable, "-m", "groma.cli.main", "view", "scene.npz", "--port", "0", "--no-browser"],
@@ -334,7 +335,8 @@ def test_ctrl_c_ends_it(tmp_path):
     try:
         lines = [process.stdout.readline(), process.stdout.readline()]
         assert "Ctrl-C ends" in lines[1]
-        process.send_signal(signal.SIGINT)
+        for number in signals:  # as when Ctrl-C is pressed twice
+            process.send_signal(number)
         rest, errors = process.communicate(timeout=60)
     finally:
         process.kill()

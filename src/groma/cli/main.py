@@ -20,7 +20,7 @@ def run(arguments: list[str] | None = None) -> int:
     """Run the command line with ``arguments`` (default: those of the process) and return the exit code."""
     from groma.cli.shared.interrupt import INTERRUPTED, PROCESS
 
-    PROCESS.asked = PROCESS.told = False
+    PROCESS.asked = PROCESS.told = PROCESS.regular = False
     try:
         from groma.cli.app import app
 

@@ -31,6 +31,7 @@ from groma.errors import FileFormatError, GromaError, InputError
 from groma.execution import map_work
 from groma.features.images import GrayImage, smoothed, to_gray
 from groma.gates import gate
+from groma.io.colmap.files import is_model
 from groma.scene import Scene
 
 
@@ -69,6 +70,8 @@ def image_files(folder: Path) -> list[Path]:
     if not files:
         if others := _with_endings(folder, UNREAD):
             raise InputError(f"{folder} holds {_of_unread_kind(others, folder)}. Convert them to JPEG or PNG.")
+        if is_model(folder):
+            raise InputError(f"{folder} holds a model, but no images. Pass the folder of its photographs.")
         raise InputError(f"{folder} holds no images ({', '.join(IMAGES)}). Check the path.")
     wrong = next((name for path in files if not is_text(name := path.relative_to(folder).as_posix())), None)
     if wrong is not None:

@@ -82,14 +82,21 @@ def localize(
     from groma.cli.shared.extending import DESCRIBING, LOCALIZING
     from groma.cli.shared.interrupt import stages_that_are_kept
     from groma.cli.shared.mapping import WRITING
+    from groma.errors import InputError
     from groma.execution import work_with
     from groma.features.images import one_opencv_thread
+    from groma.io.colmap.files import is_model
     from groma.localization.calibration import CalibrationChoice
     from groma.localization.localizer import LocalizeOptions, Localizer
     from groma.localization.pose.absolute_pose import PoseOptions
     from groma.localization.result import LocalizeResult
     from groma.localization.run import localize_images, query_files
 
+    first = queries[0]
+    if not is_model(map_) and map_.suffix != ".npz" and (is_model(first) or first.suffix == ".npz"):
+        raise InputError(
+            f"{first} is a map and {map_} is none: groma localize {first} {map_} -o {output}, the map first."
+        )
     choice = CalibrationChoice(calibration, camera_model, camera_parameters(camera_params))
     files = query_files(queries)
     options = LocalizeOptions(lines=lines, min_segment_length=min_length, pose=PoseOptions(seed=seed))

@@ -8,6 +8,7 @@ import typer
 
 from groma.cli.shared import options as _options
 from groma.cli.shared.console import Console
+from groma.cli.shared.interrupt import PROCESS
 
 
 def view(
@@ -56,7 +57,7 @@ def view(
     console.say(sentence_of(scene))
     if images is None and (images := folder_of_images(source, scene.images.names)) is not None:
         console.say(f"Photographs: {images}")
-    # Once the page is served, Ctrl-C is the regular way to end.
+    PROCESS.regular = True  # once the page is served, Ctrl-C is the regular way to end
     with serving(scene, images, port, say=console.warn) as shown, contextlib.suppress(KeyboardInterrupt):
         address = f"http://localhost:{shown.server.get_port()}"
         if images is not None and shown.num_pictures == 0:
@@ -86,6 +87,7 @@ def _follow(output: Path, port: int, browser: bool, console: Console, force: boo
             return f"There is nothing in {output} yet; waiting for groma track SEQUENCE -o {output}."
         return f"The track of {output} is {state}."
 
+    PROCESS.regular = True
     with following(output, port, say=console.warn) as shown, contextlib.suppress(KeyboardInterrupt):
         shown.refresh()
         address = f"http://localhost:{shown.server.get_port()}"

@@ -28,9 +28,13 @@ class Interruption:
         self.asked = False
         #: Whether the interruption was reported.
         self.told = False
+        #: Whether an interrupt is the regular end: what comes after the first is ignored.
+        self.regular = False
 
     def handle(self, number: int, frame: FrameType | None) -> None:
         """Record a signal and interrupt."""
+        if self.asked and self.regular:
+            return
         self.asked = True
         raise KeyboardInterrupt
 
