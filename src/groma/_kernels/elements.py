@@ -7,12 +7,12 @@ on making it, is that. Here only the fields that are used are read, and a range 
 that is assigned once. Addresses and counts are computed by the same formulas in the same blocks, so the machine code is
 the same in nearly all functions.
 
-Numba searches its rules for each ``a + b``; here that is one instruction. ``row[:] = 0.0`` compares shapes there, in some
-300 instructions, ``row[a:b]`` asks for the sign of the step in 150, and ``max(a, b)`` calls a function in 30.
+Numba searches its rules for each ``a + b``; here that is one instruction. ``row[:] = 0.0`` compares shapes there, in
+some 300 instructions, ``row[a:b]`` asks for the sign of the step in 150, and ``max(a, b)`` calls a function in 30.
 
 In come Numba's statements; out comes ``NativeLowering``, the step of the compiler that turns them into LLVM's code.
-Whatever is not part of an array by integers and a slice after them, or a range with step 1, goes the way of Numba, and so do arrays if bounds
-are to be checked.
+Whatever is not part of an array by integers and a slice after them, or a range with step 1, goes the way of Numba, and
+so do arrays if bounds are to be checked.
 """
 
 from __future__ import annotations
