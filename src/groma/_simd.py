@@ -217,6 +217,7 @@ def _add_matvec(typing, y, y0, A, a0, x, x0, rows, lanes):
 
 def _blocks(C, c0, *factors):
     A, a0, a_stride, B, b0, b_stride, depth, rows, lanes = factors
+    A, B, C = A.reshape(-1), B.reshape(-1), C.reshape(-1)
     m, p, q = len(depth), len(rows), len(lanes)
     first = [A[a0 + k * a_stride : a0 + k * a_stride + p] for k in range(m)]
     second = [B[b0 + k * b_stride : b0 + k * b_stride + q] for k in range(m)]
@@ -236,13 +237,13 @@ def _set_product_plain(*arguments):
 
 def _add_matvec_plain(y, y0, A, a0, x, x0, rows, lanes):
     p, q = len(rows), len(lanes)
-    y[y0 : y0 + p] += A[a0 : a0 + p * q].reshape(p, q) @ x[x0 : x0 + q]
+    y[y0 : y0 + p] += A.reshape(-1)[a0 : a0 + p * q].reshape(p, q) @ x[x0 : x0 + q]
 
 
 _plain = bool(config.DISABLE_JIT)  # type: ignore[attr-defined]
 
-#: ``add_product(C, c0, A, a0, a_stride, B, b0, b_stride, depth, rows, lanes)``: C += A^T B for flat float64 arrays
-#: at element offsets. A is depth x rows and B depth x lanes, with the given distances between their rows; C is
+#: ``add_product(C, c0, A, a0, a_stride, B, b0, b_stride, depth, rows, lanes)``: C += A^T B for contiguous float64
+#: arrays, at element offsets. A is depth x rows and B depth x lanes, with the given distances between their rows; C is
 #: rows x lanes without gaps. The last three arguments are widths.
 add_product: Callable[..., None] = _add_product_plain if _plain else _add_product
 #: As :data:`add_product`, but C = A^T B.

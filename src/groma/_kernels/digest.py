@@ -61,7 +61,7 @@ _T = TypeVar("_T")
 #: Settings of Numba that change the code, besides the processor.
 _SETTINGS = ("OPT", "BOUNDSCHECK", "DEBUGINFO_DEFAULT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "USING_SVML")
 #: Files of this room that decide what code comes out of a function.
-COMPILER = ("elements.py", "inner.py", "lifetimes.py", "rewrites.py", "shortcuts.py")
+COMPILER = ("elements.py", "inner.py", "lifetimes.py", "ranges.py", "rewrites.py", "shortcuts.py")
 _CHANGE_IN_PLACE = (list, dict, set, np.ndarray)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Code for numbers and parts of arrays and for ranges, a fifth to a third as long as Numba's own.
+"""Code for numbers and parts of arrays, a fifth to a third as long as Numba's own.
 
 Numba copies an array's description to the stack, unpacks all of it, and leaves it to LLVM to remove most. Kernels are
 full of ``J[0, 3]`` and ``for i in range(n)``, so half of what LLVM parses and optimises, and much of what Python spends
@@ -7,11 +7,12 @@ on making it, is that. Here only the fields that are used are read, and a range 
 that is assigned once. Addresses and counts are computed by the same formulas in the same blocks, so the machine code is
 the same in nearly all functions.
 
-Numba searches its rules for each ``a + b``; here that is one instruction.
+Numba searches its rules for each ``a + b``; here that is one instruction. ``row[:] = 0.0`` compares shapes there, in
+some 300 instructions, ``row[a:b]`` asks for the sign of the step in 150, and ``max(a, b)`` calls a function in 30.
 
 In come Numba's statements; out comes ``NativeLowering``, the step of the compiler that turns them into LLVM's code.
-Whatever is not part of an array by integers or a range with step 1 goes the way of Numba, and so do arrays if bounds
-are to be checked.
+Whatever is not part of an array by integers and a slice after them, or a range with step 1, goes the way of Numba, and
+so do arrays if bounds are to be checked.
 """
 
 from __future__ import annotations
@@ -26,13 +27,16 @@ from llvmlite import ir as llvm
 from numba.core import analysis, cgutils, ir, types
 from numba.core.compiler_machinery import register_pass
 from numba.core.debuginfo import DummyDIBuilder
-from numba.core.lowering import Lower
 from numba.core.typed_passes import NativeLowering as NumbaLowering
+
+from groma._kernels.ranges import RangeLower
 
 _WORD = llvm.IntType(64)
 _ZERO, _HALF = llvm.Constant(_WORD, 0), llvm.IntType(32)
 #: Places in an array's description (Numba's format).
 _DATA, _SHAPE, _STRIDES = 4, 5, 6
+#: What compares the largest and the least of numbers with the next.
+_EXTREME = {max: ">", min: "<"}
 #: What a loop over a range is made of, and numbers of arrays by fixed indices.
 _PARTS = {"pair_first": 0, "pair_second": 1}
 _COUNTING = ("static_getitem", "call", "getiter", "iternext", *_PARTS)
@@ -55,12 +59,21 @@ _COMPARED = {
 
 
 def _kinds(array: Any, index: Any) -> tuple[Any, ...] | None:
-    """Return the types of the integers by which an index names part of an array; None for any other index."""
+    """Return the types of the integers by which an index names part of an array, and of a slice after them.
+
+    None for any other index.
+    """
     if type(array) is not types.Array or not isinstance(array.dtype, types.Number | types.Boolean):
         return None
     kinds = tuple(index.types) if isinstance(index, types.Tuple | types.UniTuple) else (index,)
-    fits = 0 < len(kinds) <= array.ndim and all(isinstance(kind, types.Integer) for kind in kinds)
+    whole = kinds[:-1] if kinds and kinds[-1] == types.slice2_type else kinds
+    fits = 0 < len(kinds) <= array.ndim and all(isinstance(kind, types.Integer) for kind in whole)
     return kinds if fits else None
+
+
+def _is_all(index: Any) -> bool:
+    """Whether an index that is written in the code names all of an array."""
+    return all(part == slice(None) for part in (index if type(index) is tuple else (index,)))
 
 
 def _instruction(build: Any, op: Any, signature: Any) -> Callable[[Any, Any], Any] | None:
@@ -91,13 +104,21 @@ def _leads(start: int | None, offset: int, above: dict[int, set[int]]) -> bool:
     return start is not None and start < offset and start in above[offset]
 
 
+def _product(build: Any, lengths: list[Any]) -> Any:
+    """Return the product of lengths; None of none."""
+    total = None
+    for length in lengths:
+        total = length if total is None else build.mul(total, length, flags=["nsw"])
+    return total
+
+
 @cache
 def _is_counted(models: Any, kind: Any) -> bool:
     return models[kind].contains_nrt_meminfo()
 
 
-class _Lower(Lower):
-    """Numba's, with short code for numbers of arrays and for variables without a count of references."""
+class _Lower(RangeLower):
+    """Numba's, with short code for parts of arrays, ranges, and variables without a count of references."""
 
     @cached_property
     def _is_plain(self) -> bool:
@@ -165,6 +186,11 @@ class _Lower(Lower):
             return super().alloca_lltype(name, lltype, datamodel)
         return cgutils.alloca_once(self.builder, lltype, name=name, zfill=False)
 
+    def lower_inst(self, inst: Any) -> None:
+        """Write the same number to all of an array by one loop."""
+        if type(inst) is not ir.StaticSetItem or not _is_all(inst.index) or not self._fill(inst.target, (), inst.value):
+            super().lower_inst(inst)
+
     def lower_expr(self, resty: Any, expr: Any) -> Any:
         """Spare arrays the search for code for fixed indices, of which there is none; count by short code."""
         if expr.op not in _COUNTING:
@@ -173,6 +199,10 @@ class _Lower(Lower):
         if expr.op == "static_getitem" and expr.index_var is not None:
             if type(kind) is types.Array:
                 return self.lower_getitem(resty, expr, expr.value, expr.index_var, self.fndesc.calltypes[expr])
+        elif expr.op == "call" and getattr(kind, "typing_key", None) in _EXTREME:
+            if resty in _REAL | _WHOLE and len(expr.args) > 1 and not expr.vararg:
+                if all(types.unliteral(self.typeof(one.name)) == resty for one in expr.args):
+                    return self._extreme(_EXTREME[kind.typing_key], resty, expr.args)
         elif expr.op == "call" and isinstance(resty, types.RangeType) and getattr(kind, "typing_key", None) is range:
             return self._range(expr, resty)
         elif expr.op == "getiter" and isinstance(kind, types.RangeType):
@@ -211,61 +241,22 @@ class _Lower(Lower):
             found = np_complex_div_impl(self.context, build, signature, (first, second))
         return self.context.cast(build, found, kind, resty)
 
-    def _range(self, expr: Any, kind: Any) -> Any:
-        """Return start, end and step."""
-        signature = self.fndesc.calltypes[expr]
-        given = self.fold_call_args(self.typeof(expr.func.name), signature, expr.args, expr.vararg, expr.kws)
-        word = given[0].type
-        start, end, step = (word(0), *given, word(1)) if len(given) == 1 else (*given, word(1))[:3]
-        return self._filled(self.context.get_value_type(kind), (start, end, step))
-
-    def _start(self, state: Any, expr: Any, kind: Any) -> Any:
-        """Return where a range has come to: a number, how many are left, and the step."""
+    def _extreme(self, comparison: str, kind: Any, names: Any) -> Any:
+        """Return the largest or the least of some numbers, as Python finds it."""
         build: Any = self.builder
-        start, end, step = (build.extract_value(state, place) for place in range(3))
-        if not (isinstance(step, llvm.Constant) and step.constant == 1):
-            return super().lower_expr(kind, expr)
-        block = build.append_basic_block()  # as Numba does; without, LLVM orders blocks in another way
-        build.branch(block)
-        build.position_at_end(block)
-        number, left = (cgutils.alloca_once(build, start.type) for _ in range(2))
-        build.store(start, number)
-        length = build.sub(end, start)
-        is_empty = build.xor(build.icmp_signed(">", length, start.type(0)), cgutils.true_bit)
-        with build.if_else(is_empty) as (then, otherwise):
-            with then:
-                build.store(start.type(0), left)
-            with otherwise:
-                build.store(length, left)
-        return self._filled(self.context.get_value_type(kind), (number, end, step, left))
-
-    def _next(self, state: Any, kind: Any) -> Any:
-        """Return the next number, and whether there is one."""
-        build: Any = self.builder
-        number, _, step, left = (build.extract_value(state, place) for place in range(4))
-        count = build.load(left)
-        one = count.type(1)
-        found = cgutils.alloca_once(build, count.type, zfill=True)
-        is_there = build.icmp_signed(">", count, count.type(0))
-        with build.if_then(is_there):
-            value = build.load(number)
-            build.store(value, found)
-            build.store(build.sub(count, one, flags=["nsw"]), left)
-            build.store(build.add(value, step), number)
-        return self._filled(self.context.get_value_type(kind), (build.load(found), is_there))
-
-    def _filled(self, kind: Any, parts: Any) -> Any:
-        """Return a tuple of given parts."""
-        value = kind(llvm.Undefined)
-        for place, part in enumerate(parts):
-            value = self.builder.insert_value(value, part, place)
-        return value
+        compare = build.fcmp_ordered if kind in _REAL else build.icmp_signed
+        found, *others = (
+            self.context.cast(build, self.loadvar(one.name), self.typeof(one.name), kind) for one in names
+        )
+        for other in others:
+            found = build.select(compare(comparison, other, found), other, found)
+        return found
 
     def lower_getitem(self, resty: Any, expr: Any, value: Any, index: Any, signature: Any) -> Any:
         """Read one number, or name a part of an array by its first indices."""
         array = self.typeof(value.name)
         kinds, found = self._kinds(array, index), signature.return_type
-        if kinds is not None and type(found) is types.Array and found.ndim == array.ndim - len(kinds):
+        if kinds is not None and type(found) is types.Array:
             part = self._view(value.name, array, index.name, kinds)
             self.incref(found, part)
             return self.context.cast(self.builder, part, found, resty)
@@ -277,16 +268,30 @@ class _Lower(Lower):
         return self.context.cast(self.builder, found, array.dtype, resty)
 
     def lower_setitem(self, target_var: Any, index_var: Any, value_var: Any, signature: Any) -> Any:
-        """Write one number."""
-        array, kind = self.typeof(target_var.name), self.typeof(value_var.name)
-        kinds = self._kinds(array, index_var)
-        is_one = kinds is not None and len(kinds) == array.ndim
-        if kinds is None or not is_one or not isinstance(types.unliteral(kind), types.Number | types.Boolean):
-            return super().lower_setitem(target_var, index_var, value_var, signature)
+        """Write one number, to one place or to all that the first indices name."""
+        kinds = self._kinds(self.typeof(target_var.name), index_var)
+        if kinds is None or not self._fill(target_var, kinds, value_var, index_var.name):
+            super().lower_setitem(target_var, index_var, value_var, signature)
+
+    def _fill(self, target: Any, kinds: tuple[Any, ...], value: Any, index_name: str = "") -> bool:
+        """Write a number to part of an array; False where that is left to Numba."""
+        array, kind = self.typeof(target.name), self.typeof(value.name)
+        is_simple = type(array) is types.Array and isinstance(array.dtype, types.Number | types.Boolean)
+        is_simple &= isinstance(types.unliteral(kind), types.Number | types.Boolean) and types.slice2_type not in kinds
+        if not is_simple or (len(kinds) < array.ndim and array.layout != "C") or self.context.enable_boundscheck:
+            return False
         from numba.np.arrayobj import store_item
 
-        value = self.context.cast(self.builder, self.loadvar(value_var.name), kind, array.dtype)
-        store_item(self.context, self.builder, array, value, self._place(target_var.name, array, index_var.name, kinds))
+        build: Any = self.builder
+        number = self.context.cast(build, self.loadvar(value.name), kind, array.dtype)
+        place = self._place(target.name, array, index_name, kinds) if kinds else self._field(target.name, _DATA)
+        count = _product(build, [self._field(target.name, _SHAPE, axis) for axis in range(len(kinds), array.ndim)])
+        if count is None:
+            store_item(self.context, build, array, number, place)
+            return True
+        with cgutils.for_range(build, count) as loop:
+            store_item(self.context, build, array, number, build.gep(place, [loop.index]))
+        return True
 
     def _kinds(self, array: Any, index: Any) -> tuple[Any, ...] | None:
         """As above; None where Numba is asked to check bounds, too."""
@@ -294,17 +299,31 @@ class _Lower(Lower):
 
     def _view(self, name: str, array: Any, index_name: str, kinds: tuple[Any, ...]) -> Any:
         """Return the description of part of an array."""
-        place, axes = self._place(name, array, index_name, kinds), range(len(kinds), array.ndim)
-        shape, strides = ([self._field(name, field, axis) for axis in axes] for field in (_SHAPE, _STRIDES))
         build: Any = self.builder
-        count = shape[0]
-        for length in shape[1:]:
-            count = build.mul(count, length, flags=["nsw"])
+        place, axes = self._place(name, array, index_name, kinds), range(len(kinds), array.ndim)
+        if kinds[-1] == types.slice2_type:
+            axes = range(len(kinds) - 1, array.ndim)
+        shape, strides = ([self._field(name, field, axis) for axis in axes] for field in (_SHAPE, _STRIDES))
+        if kinds[-1] == types.slice2_type:
+            index = self.loadvar(index_name)
+            if isinstance(self.typeof(index_name), types.BaseTuple):
+                index = build.extract_value(index, len(kinds) - 1)
+            start, stop = (self._bound(build.extract_value(index, side), shape[0]) for side in range(2))
+            shape[0] = build.sub(stop, start)
+            shape[0] = build.select(build.icmp_signed("<", shape[0], _ZERO), _ZERO, shape[0])
+        count = _product(build, shape)
         lengths = llvm.ArrayType(_WORD, len(axes))
         owner, parent, size = (self._field(name, field) for field in (0, 1, 3))
         packed = self._filled(lengths, shape), self._filled(lengths, strides)
         kind = self.context.get_value_type(array.copy(ndim=len(axes)))
         return self._filled(kind, (owner, parent, count, size, place, *packed))
+
+    def _bound(self, index: Any, length: Any) -> Any:
+        """Return an end of a slice, counted from the start, inside an array."""
+        build: Any = self.builder
+        index = build.select(build.icmp_signed("<", index, _ZERO), build.add(index, length), index)
+        index = build.select(build.icmp_signed("<", index, _ZERO), _ZERO, index)
+        return build.select(build.icmp_signed(">=", index, length), length, index)
 
     def _place(self, name: str, array: Any, index_name: str, kinds: tuple[Any, ...]) -> Any:
         """Return the address of a number, the first one if indices are missing."""
@@ -313,7 +332,10 @@ class _Lower(Lower):
         indices = []
         for axis, kind in enumerate(kinds):
             given = index if is_one else build.extract_value(index, axis)
-            indices.append(self._from_start(given, kind, name, axis))
+            if kind == types.slice2_type:
+                indices.append(self._bound(build.extract_value(given, 0), self._field(name, _SHAPE, axis)))
+            else:
+                indices.append(self._from_start(given, kind, name, axis))
         if array.layout == "A":
             steps = [self._field(name, _STRIDES, axis) for axis in range(len(kinds))]
             data = build.bitcast(self._field(name, _DATA), llvm.IntType(8).as_pointer())

@@ -37,7 +37,7 @@ def _project_all(model_tag, params, points, pixels):
     stride = 1 if params.shape[0] > 1 else 0
     for i in range(points.shape[0]):
         if not project(model_tag, params[i * stride], points[i], pixels[i]):
-            pixels[i, :] = np.nan
+            pixels[i] = np.nan
 
 
 @loop
@@ -45,9 +45,9 @@ def _project_jacobian_all(model_tag, params, points, pixels, J_points, J_params)
     stride = 1 if params.shape[0] > 1 else 0
     for i in range(points.shape[0]):
         if not project_jacobian(model_tag, params[i * stride], points[i], pixels[i], J_points[i], J_params[i]):
-            pixels[i, :] = np.nan
-            J_points[i, :, :] = np.nan
-            J_params[i, :, :] = np.nan
+            pixels[i] = np.nan
+            J_points[i] = np.nan
+            J_params[i] = np.nan
 
 
 @loop
@@ -55,7 +55,7 @@ def _unproject_all(model_tag, params, pixels, bearings):
     stride = 1 if params.shape[0] > 1 else 0
     for i in range(pixels.shape[0]):
         if not unproject(model_tag, params[i * stride], pixels[i], bearings[i]):
-            bearings[i, :] = np.nan
+            bearings[i] = np.nan
 
 
 @loop

@@ -99,10 +99,9 @@ def cost_whitened(residual, begin, information, loss_tag, parameters, landmark, 
 def chain_rule(record, begin, raw, column, index, basis, raw_width, dof_width, one):
     """Columns of the chart = columns in factor coordinates times the basis of the chart."""
     n, m, columns = record.shape
-    flat, bases = record.reshape(record.size), basis.reshape(basis.size)
     size, dof = len(raw_width), len(dof_width)
     for i in range(n):
         b = np.int64(index[begin + i]) * (size * dof)
         for a in range(m):
             row = (i * m + a) * columns
-            set_product(flat, row + column, flat, row + raw, 1, bases, b, dof, raw_width, one, dof_width)
+            set_product(record, row + column, record, row + raw, 1, basis, b, dof, raw_width, one, dof_width)

@@ -22,12 +22,11 @@ Blocks = dict[tuple[int, int], FloatArray]
 def add_block_products(blocks, rows, columns, same_class, x_row, x_column, y_row, y_column, a_width, b_width, one):
     """Add S x to y for the blocks of one class pair, and their mirror images below the diagonal."""
     a, b = len(a_width), len(b_width)
-    flat = blocks.reshape(blocks.size)
     for i in range(rows.shape[0]):
         r, c = np.int64(rows[i]), np.int64(columns[i])
-        add_matvec(y_row, r * a, flat, i * a * b, x_column, c * b, a_width, b_width)
+        add_matvec(y_row, r * a, blocks, i * a * b, x_column, c * b, a_width, b_width)
         if not same_class or r != c:
-            add_product(y_column, c * b, x_row, r * a, 1, flat, i * a * b, b, a_width, one, b_width)
+            add_product(y_column, c * b, x_row, r * a, 1, blocks, i * a * b, b, a_width, one, b_width)
 
 
 # ----------------------------------------------------------------------------------------------------------- Public
