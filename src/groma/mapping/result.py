@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from groma.adjustment.survey.gross_errors import reliability_of
 from groma.adjustment.survey.protocol import protocol
 from groma.adjustment.uncertainty import pose_uncertainty
 from groma.bounded.json_text import json_text
-from groma.execution import begin, beside
+from groma.execution import beside
 from groma.io import atomic_output, write_geometry, write_scene
 from groma.mapping.depth.points import MeasuredDepths
 from groma.mapping.lines.confidence import line_confidence
@@ -79,7 +79,6 @@ class MapResult:
 
     def diagnose(self) -> Diagnosis:
         """Say in words what the observations determine, at the noise and with the loss of the last adjustment."""
-        self._camera_noise  # noqa: B018 - the summary asks for it; it is begun here, beside the diagnosis
         found = diagnose_scene(self.scene, problem=_problem_of(self.scene, self.adjusted_with))
         missing = self.num_photographs - self.scene.num_images
         if 2 * missing <= self.num_photographs:
@@ -91,10 +90,6 @@ class MapResult:
         left = Finding("photographs_left_out", "problem", sentence, values={"count": float(missing)})
         others = tuple(finding for finding in found.findings if finding.kind != "determined")
         return replace(found, findings=(left, *others))
-
-    @cached_property
-    def _camera_noise(self) -> Callable[[], dict[str, Any] | None]:
-        return begin(self.pose_uncertainty)
 
     def pose_uncertainty(self) -> dict[str, Any] | None:
         """Return how well the cameras are known, by leaving out one landmark after the other."""
@@ -125,7 +120,7 @@ class MapResult:
                 "intrinsics": self.adjusted_with.refine_intrinsics is not False,
             },
             "diagnosis": None if diagnosis is None else diagnosis.to_dict(),
-            "pose_uncertainty": None if diagnosis is None else self._camera_noise(),
+            "pose_uncertainty": None if diagnosis is None else self.pose_uncertainty(),
         }
         if contributions:
             numbers["contributions"] = [entry.to_dict() for entry in contributions]
