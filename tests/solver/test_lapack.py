@@ -6,7 +6,9 @@ import sys
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
+from groma.solver.linear.blas import one_blas_thread
 from groma.solver.linear.lapack import potrf, potri, potrs, solve_lower
 
 
@@ -46,3 +48,18 @@ def test_scipy_has_the_same_module_whoever_loads_it_first(first):
         "assert ours.potrf is theirs.dpotrf"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
+def blas_threads():
+    return {entry["num_threads"] for entry in threadpool_info() if entry["user_api"] == "blas"}
+
+
+def test_the_limit_ends_with_the_last_of_overlapping_contexts():
+    with threadpool_limits(2, "blas"):
+        before, first, second = blas_threads(), one_blas_thread(), one_blas_thread()
+        first.__enter__()
+        second.__enter__()
+        first.__exit__(None, None, None)
+        assert blas_threads() == {1}
+        second.__exit__(None, None, None)
+        assert blas_threads() == before

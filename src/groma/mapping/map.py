@@ -140,12 +140,12 @@ def map_images(
     given, near, options = _in_usual_frame(model, options)
     read_by_rows(given or Scene(), options, depth)  # refuses depths beside it before anything is computed
     alone = model is None and line_matches is None and not options.rigs
+    key = begin(partial(digest, __version__, digest_files(folder, files), given))
     sizes, copies = checked_photographs(folder, files, given, options.lines.min_images, alone, say)
     masked = check_masks(options.masks, sizes, say)
     if survey:
         check_survey(survey, tuple(sizes), list(sizes.values()))
-    key = digest(__version__, digest_files(folder, files), given)
-    with one_blas_thread(), work_with(options.threads), Stages(Path(work), key, options, say) as stages:
+    with one_blas_thread(), work_with(options.threads), Stages(Path(work), key(), options, say) as stages:
         registered = start_of(folder, list(sizes), given, stages)
         base, segments = _base_of(folder, PointBase(registered.scene, near), line_matches, survey, depth, stages)
         matches = matches_for(options, folder, base.points, segments, line_matches)

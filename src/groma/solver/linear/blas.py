@@ -7,8 +7,11 @@ times the processor time when the machine has other work.
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
+from typing import Any
 
 from threadpoolctl import ThreadpoolController
 
@@ -20,6 +23,20 @@ def _controller() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-def one_blas_thread() -> AbstractContextManager:
-    """Return a context in which BLAS calls run on the calling thread."""
-    return _controller().limit(limits=1, user_api="blas")
+#: The limit, once for each context that some thread is in.
+_held: list[Any] = []
+_lock = threading.Lock()
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """BLAS calls inside run on the calling thread; the limit ends with the last context of any thread."""
+    with _lock:
+        _held.append(_held[0] if _held else _controller().limit(limits=1, user_api="blas"))
+    try:
+        yield
+    finally:
+        with _lock:
+            limit = _held.pop()
+            if not _held:
+                limit.restore_original_limits()

@@ -106,12 +106,13 @@ class Tracks:
 
     def lines_near_images(self, neighbors: list[IntArray]) -> list[IntArray]:
         """Lines to look for in each image: those seen in it or in a neighbour."""
-        pointers, near, looked_for = self.views.pointers, [], np.zeros(self.num_lines + 1, bool)
+        rows, line = self.members()
+        begin, near, looked_for = np.searchsorted(rows, self.views.pointers), [], np.zeros(self.num_lines, bool)
         for i, row in enumerate(neighbors):
             looked_for[:] = False
             for j in (i, *row):
-                looked_for[self.line_of[pointers[j] : pointers[j + 1]]] = True  # the last one stands for no line
-            near.append(np.flatnonzero(looked_for[:-1]))
+                looked_for[line[begin[j] : begin[j + 1]]] = True
+            near.append(np.flatnonzero(looked_for))
         return near
 
     def direction(self) -> FloatArray:
