@@ -274,6 +274,7 @@ def _expect_fisheyes(pycolmap: Any, database: Path) -> None:
 def find_features(
     pycolmap: Any, database: Path, images: Path, names: list[str], options: PointModelOptions, say: Progress
 ) -> None:
+    """Find the features of the images that have none yet, as far as their masks allow."""
     with opened(pycolmap, database) as content:
         entered = content.read_all_images()
         done = {image.name for image in entered if content.exists_descriptors(image.image_id)}
@@ -368,6 +369,3 @@ def explained(folder: Path) -> Iterator[None]:
             f"The points of the images cannot be reconstructed in {folder}: {reason.rstrip('.')}. See that there is "
             "room and you may write there; the same command then goes on. If it fails again, remove that folder."
         ) from error
-
-
-__all__ = ["EXHAUSTIVE_LIMIT", "PointModelOptions", "reconstruct_points"]
