@@ -46,7 +46,7 @@ def test_a_model_that_lacks_a_file_is_named_beside_whole_ones(tmp_path):
 @pytest.fixture
 def without_images(monkeypatch):
     """Reconstruction whose features and matches are those already in the database: none."""
-    for name in ("_enter_images", "_find_features", "_match", "places_by_gps"):
+    for name in ("_enter_images", "find_features", "match_pairs", "places_by_gps"):
         monkeypatch.setattr(colmap_sfm, name, lambda *arguments: None)
 
 

@@ -20,7 +20,7 @@ from groma.geometry import quaternion
 from groma.io.colmap.load import load_pycolmap, opened, quiet
 from groma.io.colmap.model import from_pycolmap, to_pycolmap
 from groma.io.colmap.pairs import blocks_of_pairs
-from groma.io.colmap.sfm import PointModelOptions, Progress, _check_room, _explained, _find_features, _match
+from groma.io.colmap.sfm import PointModelOptions, Progress, check_room, explained, find_features, match_pairs
 from groma.scene import PosePriors, Scene
 
 #: Matches that a pair of images, or an image and a map, must agree on: COLMAP's numbers (convention: as in COLMAP).
@@ -69,18 +69,18 @@ class PosedPhotographs:
             If there is no room in the folder, or pycolmap fails otherwise.
         """
         pycolmap, names = load_pycolmap(), list(self.scene.images.names)
-        with quiet(pycolmap), _explained(self.work):
+        with quiet(pycolmap), explained(self.work):
             pycolmap.set_random_seed(self.options.seed)
             self.work.mkdir(parents=True, exist_ok=True)
-            _check_room(self.work)
+            check_room(self.work)
             _enter(pycolmap, self.database, self.scene)
-            _find_features(pycolmap, self.database, self.images, names, self.options, say)
-            _match(pycolmap, self.database, names, _blocks(self.scene), self.options, say)
+            find_features(pycolmap, self.database, self.images, names, self.options, say)
+            match_pairs(pycolmap, self.database, names, _blocks(self.scene), self.options, say)
 
     def pairs(self) -> Iterator[MatchedPair]:
         """Yield the pairs whose matches agree on a motion between the two images."""
         pycolmap = load_pycolmap()
-        with quiet(pycolmap), _explained(self.work), opened(pycolmap, self.database) as content:
+        with quiet(pycolmap), explained(self.work), opened(pycolmap, self.database) as content:
             row_of = {number: row for row, number in enumerate(self.scene.images.ids.tolist())}
             cameras = {camera.camera_id: camera for camera in content.read_all_cameras()}
             places = {number: content.read_keypoints(number)[:, :2].astype(float) for number in row_of}
@@ -131,7 +131,7 @@ class PosedPhotographs:
         for name in ("merge_max_reproj_error", "complete_max_reproj_error"):
             setattr(options.triangulation, name, max_error_px)
         bare = scene.points_only().replace(pose_priors=PosePriors())
-        with quiet(pycolmap), _explained(self.work):
+        with quiet(pycolmap), explained(self.work):
             start = to_pycolmap(bare.keep(points=[]))
             found = pycolmap.triangulate_points(
                 start, self.database, self.images, self.work / "points", options=options
@@ -148,7 +148,7 @@ class PosedPhotographs:
         seen = model.point_observations
         image_ids = model.images.ids[seen.image_idx]
         pixels, points = [], []
-        with quiet(pycolmap), _explained(self.work), opened(pycolmap, self.database) as content:
+        with quiet(pycolmap), explained(self.work), opened(pycolmap, self.database) as content:
             places = content.read_keypoints(number)[:, :2].astype(float)
             for other in model.images.ids.tolist():
                 if other == number or not content.exists_two_view_geometry(number, other):

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from groma.io.colmap.load import opened
+from groma.io.colmap.load import find_sift, opened
 
 #: Longer side from which a photograph is large, pixels (cost: time only).
 _LARGE = 2000
@@ -52,14 +52,7 @@ def features_of_large(
     pycolmap.import_images(beside, images, pycolmap.CameraMode.AUTO, large)
     sift = extraction.sift
     sift.first_octave, sift.num_octaves = sift.first_octave + 1, sift.num_octaves - 1
-    pycolmap.extract_features(
-        beside,
-        images,
-        image_names=large,
-        reader_options=reader,
-        extraction_options=extraction,
-        device=pycolmap.Device.cpu,
-    )
+    find_sift(pycolmap, beside, images, large, extraction, reader)
     sift.first_octave, sift.num_octaves = sift.first_octave - 1, sift.num_octaves + 1
     enough = set()
     with opened(pycolmap, beside) as found, opened(pycolmap, database) as content:

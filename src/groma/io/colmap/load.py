@@ -10,7 +10,7 @@ from __future__ import annotations
 import signal
 import threading
 import zlib  # noqa: F401
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -46,3 +46,15 @@ def opened(pycolmap: Any, database: Path) -> Iterator[Any]:
         yield content
     finally:
         content.close()
+
+
+def find_sift(pycolmap: Any, database: Path, images: Path, names: Sequence[str], extraction: Any, reader: Any) -> None:
+    """Find the features of images that are entered in a database, and write them to it."""
+    pycolmap.extract_features(
+        database,
+        images,
+        image_names=names,
+        reader_options=reader,
+        extraction_options=extraction,
+        device=pycolmap.Device.cpu,
+    )

@@ -25,7 +25,7 @@ from groma import cameras as camera_models
 from groma._counted import counted, first_of
 from groma.errors import GromaError, InputError, OutputError, did_you_mean
 from groma.io.colmap.large_photographs import features_of_large
-from groma.io.colmap.load import load_pycolmap, opened, quiet
+from groma.io.colmap.load import find_sift, load_pycolmap, opened, quiet
 from groma.io.colmap.mappers import MAPPERS, Task
 from groma.io.colmap.masks import Masks
 from groma.io.colmap.model import from_pycolmap
@@ -153,17 +153,17 @@ def reconstruct_points(
     check_rigs(options.rigs, names)
     database = folder / "database.db"
     pycolmap.set_random_seed(options.seed)
-    with quiet(pycolmap), _explained(folder):
+    with quiet(pycolmap), explained(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        _check_room(folder)
+        check_room(folder)
         _enter_images(pycolmap, database, Path(images), names, options)
         _expect_fisheyes(pycolmap, database)
-        _find_features(pycolmap, database, Path(images), names, options, say)
+        find_features(pycolmap, database, Path(images), names, options, say)
         with opened(pycolmap, database) as content:
             ordered = by_frames(options.rigs, names)
             places = places_by_gps(content, ordered)
-        _match(pycolmap, database, ordered, blocks_of_pairs(len(names), places), options, say)
-        _check_room(folder)
+        match_pairs(pycolmap, database, ordered, blocks_of_pairs(len(names), places), options, say)
+        check_room(folder)
         models = map_frames(
             pycolmap,
             database,
@@ -271,9 +271,10 @@ def _expect_fisheyes(pycolmap: Any, database: Path) -> None:
                 content.update_camera(camera)
 
 
-def _find_features(
+def find_features(
     pycolmap: Any, database: Path, images: Path, names: list[str], options: PointModelOptions, say: Progress
 ) -> None:
+    """Find the features of the images that have none yet, as far as their masks allow."""
     with opened(pycolmap, database) as content:
         entered = content.read_all_images()
         done = {image.name for image in entered if content.exists_descriptors(image.image_id)}
@@ -289,23 +290,16 @@ def _find_features(
     for start in range(0, len(missing), batch):
         say("finding points in images", len(names) - len(missing) + start, len(names))
         wanted = missing[start : start + batch]
-        _check_room(database.parent, 2 * len(wanted) * _IMAGE_ROOM)  # large ones are in two databases for a moment
+        check_room(database.parent, 2 * len(wanted) * _IMAGE_ROOM)  # large ones are in two databases for a moment
         if masks is not None:
             for name in wanted:
                 masks.write(reader.mask_path, name, size_of[name])
         wanted = features_of_large(pycolmap, database, images, wanted, extraction, reader)
         if wanted:
-            pycolmap.extract_features(
-                database,
-                images,
-                image_names=wanted,
-                reader_options=reader,
-                extraction_options=extraction,
-                device=pycolmap.Device.cpu,
-            )
+            find_sift(pycolmap, database, images, wanted, extraction, reader)
 
 
-def _match(
+def match_pairs(
     pycolmap: Any,
     database: Path,
     names: list[str],
@@ -322,7 +316,7 @@ def _match(
     if any(name.split() != [name] for name in names):
         # Lists of pairs are split at white space; these calls need no list, but report no progress.
         say("matching points of image pairs", 0, total)
-        _check_room(database.parent, total * _PAIR_ROOM)
+        check_room(database.parent, total * _PAIR_ROOM)
         if len(names) <= EXHAUSTIVE_LIMIT:
             pycolmap.match_exhaustive(database, **common)
         else:
@@ -335,7 +329,7 @@ def _match(
     done = 0
     for block in blocks:
         say("matching points of image pairs", done, total)
-        _check_room(database.parent, len(block) * _PAIR_ROOM)
+        check_room(database.parent, len(block) * _PAIR_ROOM)
         done += len(block)
         lines = "".join(f"{names[i]} {names[j]}\n" for i, j in block)
         pairing.match_list_path.write_text(lines, encoding="utf-8")
@@ -345,7 +339,7 @@ def _match(
 # ----------------------------------------------------------------------------------------------------------- helpers
 
 
-def _check_room(folder: Path, more: int = 0) -> None:
+def check_room(folder: Path, more: int = 0) -> None:
     """Raise OutputError if the disk may be too full."""
     free, needed = shutil.disk_usage(folder).free, _ROOM + more
     if free < needed:
@@ -363,7 +357,7 @@ def _check_room(folder: Path, more: int = 0) -> None:
 
 
 @contextmanager
-def _explained(folder: Path) -> Iterator[None]:
+def explained(folder: Path) -> Iterator[None]:
     """Turn what pycolmap and the file system raise into errors of groma."""
     try:
         yield
@@ -375,6 +369,3 @@ def _explained(folder: Path) -> Iterator[None]:
             f"The points of the images cannot be reconstructed in {folder}: {reason.rstrip('.')}. See that there is "
             "room and you may write there; the same command then goes on. If it fails again, remove that folder."
         ) from error
-
-
-__all__ = ["EXHAUSTIVE_LIMIT", "PointModelOptions", "reconstruct_points"]
