@@ -156,3 +156,16 @@ def test_variables_without_a_measurement_have_no_covariance():
         for column in (0, 6, 12):
             np.testing.assert_allclose(joint[row : row + 3, column : column + 3], own, rtol=1e-6)
     assert np.isnan(joint[3:6]).all() and not joint[9:12, 9:12].any()
+
+
+def test_one_observation_of_one_point_determines_nothing():
+    """The point takes up both residuals: the motions of the world move nothing that is seen, and none is a datum."""
+    problem = scene_problem(num_points=20)
+    poses, points = problem.variables["poses"], problem.variables["points"]
+    one = dataclasses.replace(poses, state=poses.state[:1]), dataclasses.replace(points, state=points.state[:1])
+    factor = PointReprojection(
+        pose=Ref("poses", [0]), point=Ref("points", [0]), intrinsics=Ref("intrinsics", [0]), camera_model="PINHOLE",
+        pixels=np.array([[500.0, 400.0]]),
+    )  # fmt: skip
+    alone = Problem({**problem.variables, "poses": one[0], "points": one[1]}, [factor])
+    assert np.isnan(Covariances(alone, gauge="inner").of("poses")).all()

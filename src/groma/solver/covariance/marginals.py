@@ -161,7 +161,7 @@ class Covariances:
             if inverse is None:
                 raise deficiency(layout, smallest(layout, self._fronts, S), 0)
         self._sigma = divided(layout, inverse, self._size)
-        if motions is not None and motions.count:
+        if motions is not None and G.any():  # not where all that moves is seen by nothing
             weights = datum_weights(layout, datum, self._undetermined)
             parts = self._landmarks, self._solve, motions, G, self._held_landmarks
             self._datum = transformation(layout, *parts, weights)

@@ -102,8 +102,8 @@ def transformation(
     for e, part in enumerate(G_landmarks):
         weight += part.T @ (D_landmarks[e][:, None] * part)
         inner += part.T @ (D_landmarks[e][:, None] * Y_landmarks[e].reshape(part.shape))
-    values = np.linalg.eigvalsh(weight / np.sqrt(np.outer(np.diag(weight), np.diag(weight))))
-    if not (np.diag(weight) > 0).all() or not values[0] > 1e-14:
+    size = np.sqrt(np.diag(weight))
+    if not (size > 0).all() or not np.linalg.eigvalsh(weight / np.outer(size, size))[0] > 1e-14:
         raise InputError(
             "The datum does not fix the frame: some motion of the whole scene moves none of its coordinates. Name "
             "more variables, for example all poses or all points."
