@@ -114,7 +114,7 @@ ROOMS: Rooms = (
         "Localisation",
         {
             "groma.localization.pose.absolute_pose": ("AbsolutePose", "PoseOptions", "estimate_absolute_pose"),
-            "groma.localization.pose.camera": None,
+            "groma.localization.pose.camera": ("QueryCamera",),
             "groma.localization.localizer": ("LocalizeOptions", "LocalizedImage", "Localizer"),
         },
     ),

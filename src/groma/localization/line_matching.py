@@ -12,7 +12,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.features.matching.descriptor import Descriptors
 from groma.features.matching.wide_baseline import WideBaselineOptions
 from groma.features.segments import SEGMENTS, Segments
-from groma.localization.pose.camera import QueryCamera, motion_of
+from groma.localization.pose.camera import QueryCamera, pose_matrix
 
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
@@ -161,5 +161,5 @@ def _pairs_near(lines: FloatArray, segments: FloatArray, reach: float) -> tuple[
 def _projected(camera: QueryCamera, pose: FloatArray, ends: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Images (L, 2, 2) of 3D segments without distortion, cut before the camera; and which are in front of it."""
     projected, visible = np.empty((len(ends), 2, 2)), np.empty(len(ends), bool)
-    _project(np.ascontiguousarray(ends), motion_of(pose), camera.matrix, projected, visible)
+    _project(np.ascontiguousarray(ends), pose_matrix(pose), camera.matrix, projected, visible)
     return projected, visible

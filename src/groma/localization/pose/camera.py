@@ -87,12 +87,12 @@ class QueryCamera:
         return QueryCamera(table.models[row], table.params_of(row), int(table.width[row]), int(table.height[row]))
 
 
-def motion_of(cam_from_world: FloatArray) -> FloatArray:
+def pose_matrix(cam_from_world: FloatArray) -> FloatArray:
     """Matrix [R | t] (3, 4) of one pose (7,)."""
     return POSE_CHARTS["left"].ambient(cam_from_world[None]).reshape(3, 4)
 
 
 def seen_from(cam_from_world: FloatArray, points: FloatArray) -> FloatArray:
     """Points (..., 3) of the world as a camera with this pose (7,) has them."""
-    R_t = motion_of(cam_from_world)
+    R_t = pose_matrix(cam_from_world)
     return points @ R_t[:, :3].T + R_t[:, 3]
