@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 import groma
 from groma.adjustment.assemble import assemble
@@ -12,6 +13,7 @@ from groma.adjustment.misfit.jackknife import landmark_jackknife, observations_a
 from groma.adjustment.uncertainty import pose_uncertainty
 from groma.scene import CameraPositions
 from groma.scene.survey import diagonal_covariance
+from groma.scene.synthetic import holistic
 from groma.solver.covariance.marginals import Covariances
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
@@ -111,3 +113,12 @@ def test_with_a_lens_that_is_estimated_and_a_robust_loss():
     assert 0.6 < numbers["factor"] < 1.6
     held = groma.adjust(scene, groma.AdjustOptions(refine_poses=False))
     assert pose_uncertainty(held.scene, held.problem, by_landmarks=True) is None
+
+
+def test_it_has_the_same_bits_with_any_number_of_threads_of_the_linear_algebra():
+    covariances = Covariances(observations_alone(assemble(holistic(58, 0).start, OPTIONS).problem))
+    found = []
+    for number in (1, 2):
+        with threadpool_limits(number, user_api="blas"):
+            found.append(landmark_jackknife(covariances)[1])
+    assert np.array_equal(*found)

@@ -66,6 +66,7 @@ def observations_alone(problem: Problem) -> Problem:
     return Problem({name: group for name, group in problem.variables.items() if name in used}, factors)
 
 
+@one_blas_thread()
 def landmark_jackknife(covariances: Covariances) -> tuple[FloatArray, FloatArray]:
     """Return covariances (F, 6, 6) of the frames as they are stated, and by leaving out landmarks.
 
@@ -90,9 +91,8 @@ def landmark_jackknife(covariances: Covariances) -> tuple[FloatArray, FloatArray
     for kind in (kind for kind in _LANDMARKS if kind in problem.variables):
         rows = [_rows_of(factor, kind, problem, first, curvature) for factor in problem.factors]
         together = _joined([one for one in rows if one is not None], size - 1)
-        with one_blas_thread():
-            for moved in _pulls(together, stated) if together is not None else ():
-                summed += moved.T @ moved  # in their order, whoever made them
+        for moved in _pulls(together, stated) if together is not None else ():
+            summed += moved.T @ moved  # in their order, whoever made them
     share = max(curvature[0] / max(curvature[1], 1e-300), 0.1)
     found = stated @ summed @ stated / share**2
     if (known := _known_besides(problem, first, size)).any():
