@@ -19,7 +19,7 @@ from groma.solver.report import SolveReport
 from groma.solver.termination import Termination
 from groma.tracking import Tracker, TrackOptions
 from groma.tracking.backend.mapper import Mapper
-from groma.tracking.backend.submaps import Joint, Places, joined_map
+from groma.tracking.backend.submaps import Joint, PlacedMaps, joined_map
 from groma.tracking.ending import Ending
 from groma.tracking.frame.features import Features
 from groma.tracking.frame.measurements import Measurements, PointMeasurements
@@ -81,7 +81,7 @@ def _joint(older: int, newer: int) -> Joint:
 @pytest.mark.parametrize("order", [[(0, 1), (0, 2)], [(1, 2), (0, 2)], [(0, 2), (1, 2)], [(0, 1), (1, 2), (0, 2)]])
 def test_maps_are_joined_whichever_of_them_met(order):
     maps = [_map(shift) for shift in (0.0, 3.0, -5.0)]
-    places = Places.apart(maps)
+    places = PlacedMaps.apart(maps)
     for older, newer in order:
         places = places.joined(_joint(older, newer))
     assert [root for root, _ in places.where] == [0, 0, 0]

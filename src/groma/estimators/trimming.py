@@ -22,7 +22,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.geometry import incidence, line3, projection
 from groma.geometry.algebra import cofactor, dot, matrices, norm, not_negative, ratio, stack, unit, vectors
 from groma.geometry.incidence import MIN_SINE
@@ -93,11 +93,7 @@ def trim_to_ray(
     determined = usable & (sine >= min_sine) & (squared > 0.0)
     local = ratio(np.cross(across, moment), squared[..., None], determined[..., None])
     depth = dot(local, ray)
-    status = np.select(
-        [~usable, ~determined, ~(depth > 0.0)],
-        [TrimStatus.NO_IMAGE, TrimStatus.PARALLEL_TO_RAY, TrimStatus.BEHIND_CAMERA],
-        TrimStatus.OK,
-    )
+    status = _status(usable, determined, depth)
     return TrimmedPoints(point=origin + local, depth=depth, sine=sine, status=status)
 
 
@@ -154,11 +150,7 @@ def trim_in_image(
     third = camera[..., 2, :]
     size = norm(third[..., :3]) * np.sign(determinant)
     depth = ratio(dot(third[..., :3], point) + third[..., 3], size, determined & (size != 0.0))
-    status = np.select(
-        [~usable, ~determined, ~(depth > 0.0)],
-        [TrimStatus.NO_IMAGE, TrimStatus.PARALLEL_TO_RAY, TrimStatus.BEHIND_CAMERA],
-        TrimStatus.OK,
-    )
+    status = _status(usable, determined, depth)
     return TrimmedPoints(point=point, depth=depth, sine=np.broadcast_to(sine, status.shape), status=status)
 
 
@@ -177,3 +169,11 @@ def trim_segments(
     segment = vectors(segment, 4, "segment")
     ends = segment.reshape(*segment.shape[:-1], 2, 2)
     return trim_in_image(camera[..., None, :, :], line[..., None, :], ends, min_sine)
+
+
+def _status(usable: BoolArray, determined: BoolArray, depth: FloatArray) -> IntArray:
+    return np.select(
+        [~usable, ~determined, ~(depth > 0.0)],
+        [TrimStatus.NO_IMAGE, TrimStatus.PARALLEL_TO_RAY, TrimStatus.BEHIND_CAMERA],
+        TrimStatus.OK,
+    )

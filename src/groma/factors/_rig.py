@@ -26,7 +26,7 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import Columns, FloatArray, Inputs, IntArray
 from groma.errors import InputError, ShapeError
-from groma.factors._rolling import compose_rows, split_rows
+from groma.factors._rolling import compose_rows, move_back, split_rows
 from groma.factors.contract import Factor, Ref, Slot
 from groma.geometry.se3 import compose_kernel
 
@@ -156,14 +156,7 @@ def _split_all(record, begin, extrinsics, extrinsics_index, source, pose_column,
                 for j in range(6):
                     line[extrinsics_column + j] = line[source + j]
             if pose_column >= 0:
-                a0, a1, a2 = line[source], line[source + 1], line[source + 2]
-                # the lever arm: aᵀ [t]x = (a x t)ᵀ
-                b0 = line[source + 3] + a1 * T[11] - a2 * T[7]
-                b1 = line[source + 4] + a2 * T[3] - a0 * T[11]
-                b2 = line[source + 5] + a0 * T[7] - a1 * T[3]
-                for j in range(3):
-                    line[pose_column + j] = a0 * T[j] + a1 * T[4 + j] + a2 * T[8 + j]
-                    line[pose_column + 3 + j] = b0 * T[j] + b1 * T[4 + j] + b2 * T[8 + j]
+                move_back(line, source, T, pose_column)
 
 
 # ------------------------------------------------------------------------------------------------------------- Public

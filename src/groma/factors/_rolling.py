@@ -37,9 +37,10 @@ def _pose_of_row(motion, s, R, T):
 
 
 @kernel
-def _move_back(line, source, T, column):
+def move_back(line, source, T, column):
     """Write the derivative at ``source``, by the left twist of T A, as that by the left twist of A: times Ad(T)."""
     a0, a1, a2 = line[source], line[source + 1], line[source + 2]
+    # the lever arm: aᵀ [t]x = (a x t)ᵀ
     b0 = line[source + 3] + a1 * T[11] - a2 * T[7]
     b1 = line[source + 4] + a2 * T[3] - a0 * T[11]
     b2 = line[source + 5] + a0 * T[7] - a1 * T[3]
@@ -88,12 +89,12 @@ def split_rows(
                 for j in range(3):
                     line[motion_column + j] = -s * (S[0] * R[j] + S[1] * R[3 + j] + S[2] * R[6 + j])
                     line[motion_column + 3 + j] = -s * (S[3] * J[0, j] + S[4] * J[1, j] + S[5] * J[2, j])
-            _move_back(S, 0, T, 0)
+            move_back(S, 0, T, 0)
             if mounted_column >= 0:
                 for j in range(6):
                     line[mounted_column + j] = S[j]
             if pose_column >= 0:
                 if mounted.shape[0] > 0:
-                    _move_back(S, 0, mounted[mounted_index[begin + i]], 0)
+                    move_back(S, 0, mounted[mounted_index[begin + i]], 0)
                 for j in range(6):
                     line[pose_column + j] = S[j]

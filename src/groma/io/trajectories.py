@@ -37,7 +37,7 @@ from groma.scene.table import Table, column
 _LOG_LINES = 5
 
 #: Lines with content, and their numbers.
-Rows = Iterable[tuple[int, str]]
+NumberedLines = Iterable[tuple[int, str]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ class TrajectoryFormat:
     #: Given the first line that holds something: whether a file may be of this format.
     fits: Callable[[str], bool]
     #: Given the path, for messages, and the lines. Whatever it raises becomes a FileFormatError.
-    read: Callable[[Path, Rows], Trajectory]
+    read: Callable[[Path, NumberedLines], Trajectory]
     #: Returns the text.
     write: Callable[[Trajectory], str]
     #: Whether the lines hold times; without, callers may give them.
@@ -186,7 +186,7 @@ def _recognise(path: Path, number: int, line: str) -> TrajectoryFormat:
     )
 
 
-def _numbers(path: Path, rows: Rows, count: int, more: bool = False) -> tuple[FloatArray, IntArray]:
+def _numbers(path: Path, rows: NumberedLines, count: int, more: bool = False) -> tuple[FloatArray, IntArray]:
     """Return the first ``count`` numbers of each row, (N, count), and the numbers of the lines."""
     table, lines = array("d"), array("q")
     for number, line in rows:
@@ -209,23 +209,23 @@ def _unit(path: Path, lines: IntArray, quaternions: FloatArray) -> FloatArray:
     return quaternions / length[:, None]
 
 
-def _read_tum(path: Path, rows: Rows) -> Trajectory:
+def _read_tum(path: Path, rows: NumberedLines) -> Trajectory:
     table, lines = _numbers(path, rows, 8)
     return Trajectory(table[:, 0], np.hstack([TUM.quaternions(_unit(path, lines, table[:, 4:])), table[:, 1:4]]))
 
 
-def _read_euroc(path: Path, rows: Rows) -> Trajectory:
+def _read_euroc(path: Path, rows: NumberedLines) -> Trajectory:
     table, lines = _numbers(path, rows, 8, more=True)
     turned = EUROC.quaternions(_unit(path, lines, table[:, 4:]))
     return Trajectory(table[:, 0] * 1e-9, np.hstack([turned, table[:, 1:4]]))
 
 
-def _read_kitti(path: Path, rows: Rows) -> Trajectory:
+def _read_kitti(path: Path, rows: NumberedLines) -> Trajectory:
     table, lines = _numbers(path, rows, 12)
     return _of_matrices(path, lines, table.reshape(-1, 3, 4))
 
 
-def _read_log(path: Path, rows: Rows) -> Trajectory:
+def _read_log(path: Path, rows: NumberedLines) -> Trajectory:
     text = list(rows)
     if len(text) % _LOG_LINES:
         raise FileFormatError(f"{path}: expected {_LOG_LINES} lines for each pose; got {len(text)}. Is it cut off?")

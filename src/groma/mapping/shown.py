@@ -42,7 +42,7 @@ class ShownGates:
 GATES = ShownGates()
 
 
-def check_points_shown(scene: Scene, files: Sequence[Path], gates: ShownGates = GATES) -> None:
+def check_points_shown(scene: Scene, files: Sequence[Path]) -> None:
     """Check that photographs show the points of a model.
 
     Parameters
@@ -51,8 +51,6 @@ def check_points_shown(scene: Scene, files: Sequence[Path], gates: ShownGates = 
         The model. Where its images share too few points, nothing is checked.
     files
         The photographs of its images.
-    gates
-        What is compared, and how alike is enough.
 
     Raises
     ------
@@ -60,10 +58,10 @@ def check_points_shown(scene: Scene, files: Sequence[Path], gates: ShownGates = 
         If most pairs that were looked at do not.
     """
     count = np.bincount(scene.point_observations.image_idx, minlength=scene.num_images)
-    most = np.argsort(-count, kind="stable")[: gates.pairs].tolist()
-    pairs = [pair for pair in map_in_threads(partial(_compared, scene, files, gates), most) if pair is not None]
+    most = np.argsort(-count, kind="stable")[: GATES.pairs].tolist()
+    pairs = [pair for pair in map_in_threads(partial(_compared, scene, files), most) if pair is not None]
     middle = sorted(pairs)[len(pairs) // 2] if pairs else (1.0, "")
-    if middle[0] < gates.alike:
+    if middle[0] < GATES.alike:
         raise InputError(
             f"The photographs do not show the points of the model: where {middle[1]} should see the same point, they "
             f"are more alike than elsewhere in {100 * middle[0]:.0f} % of cases (right ones in nearly all, others in "
@@ -72,19 +70,19 @@ def check_points_shown(scene: Scene, files: Sequence[Path], gates: ShownGates = 
         )
 
 
-def _compared(scene: Scene, files: Sequence[Path], gates: ShownGates, image: int) -> tuple[float, str] | None:
+def _compared(scene: Scene, files: Sequence[Path], image: int) -> tuple[float, str] | None:
     """How alike a photograph and another are where both see a point, and their names; None if these points are few."""
-    other, pixels = _shared(scene, image, gates)
+    other, pixels = _shared(scene, image)
     first, second = (_described(files[i], own) for i, own in zip((image, other), pixels, strict=True))
     shown = first.any(axis=1) & second.any(axis=1)
-    if shown.sum() < gates.least:
+    if shown.sum() < GATES.least:
         return None
     alike = first[shown] @ second[shown].T
     share = float((np.diag(alike)[:, None] > alike).sum()) / (len(alike) * (len(alike) - 1))
     return share, f"{files[image]} and {files[other].name}"
 
 
-def _shared(scene: Scene, image: int, gates: ShownGates) -> tuple[int, list[FloatArray]]:
+def _shared(scene: Scene, image: int) -> tuple[int, list[FloatArray]]:
     """The image that shares most points with one, of those held alike; and the pixels (n, 2) of some in both."""
     table, rotation = scene.point_observations, quaternion.to_matrix(scene.cam_from_world[:, :4])
     own = np.flatnonzero(table.image_idx == image)
@@ -94,11 +92,11 @@ def _shared(scene: Scene, image: int, gates: ShownGates) -> tuple[int, list[Floa
     turn = rotation @ rotation[image].T
     roll = np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1])
     flat = np.array([camera_model(name).is_planar for name in scene.cameras.models])[scene.images.camera_idx]
-    count[(np.abs(roll) > gates.roll) | ~flat | (np.arange(scene.num_images) == image) | ~flat[image]] = 0
+    count[(np.abs(roll) > GATES.roll) | ~flat | (np.arange(scene.num_images) == image) | ~flat[image]] = 0
     other = int(np.argmax(count))
     there = np.flatnonzero(table.image_idx == other) if count[other] else own[:0]
     _, here, there_too = np.intersect1d(table.point_idx[own], table.point_idx[there], return_indices=True)
-    step = max(len(here) // gates.points, 1)
+    step = max(len(here) // GATES.points, 1)
     return other, [table.pixel[own[here[::step]]], table.pixel[there[there_too[::step]]]]
 
 

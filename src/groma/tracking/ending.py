@@ -23,7 +23,7 @@ from groma.tracking.backend.focal_length import focal_length_that_does_not_fit
 from groma.tracking.backend.mapper import Mapper, Present
 from groma.tracking.backend.plane_outcome import PlaneOutcome
 from groma.tracking.backend.rival_motions import motion_that_does_not_fit
-from groma.tracking.backend.submaps import Joint, Places, Submap, best_joint
+from groma.tracking.backend.submaps import Joint, PlacedMaps, Submap, best_joint
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.rectification import RightTurn
 from groma.tracking.map.track_map import TrackMap
@@ -95,7 +95,7 @@ class Ending:
     def join(self) -> tuple[tuple[int, int], ...]:
         """Merge submaps of the same place; return for each the map that holds it, and the offset of its keyframes."""
         mapper = self._mapper
-        places = Places.apart(mapper.maps)
+        places = PlacedMaps.apart(mapper.maps)
         for joint in mapper.joints.values():
             places = self._joined(places, joint)
         if mapper.options.close_loops:
@@ -106,7 +106,7 @@ class Ending:
         self._history.joined(places.where)
         return places.where
 
-    def _searched(self, places: Places, one: int, two: int) -> Places:
+    def _searched(self, places: PlacedMaps, one: int, two: int) -> PlacedMaps:
         """Search for places common to two maps."""
         mapper = self._mapper
         joint = self.attempt(
@@ -117,7 +117,7 @@ class Ending:
         )
         return places if joint is None else self._joined(places, joint)
 
-    def _joined(self, places: Places, joint: Joint) -> Places:
+    def _joined(self, places: PlacedMaps, joint: Joint) -> PlacedMaps:
         what = f"joining maps {joint.older + 1} and {joint.newer + 1}"
         return self.attempt(what, lambda: places.joined(joint), places, changes=())
 

@@ -115,7 +115,7 @@ def _lines_3d(scene: Scene, line_number: IntArray, like: Structures) -> Lines3d:
     track = np.zeros(len(seen), TRACK)
     track["image_id"] = scene.images.ids[seen.image_idx[order]]
     track["idx"] = line_number[order]
-    uncertainty = np.append(like.lines.uncertainty, -1.0)[Rows(int_ids(like.lines.ids)).of(lines.ids)]
+    uncertainty = np.append(like.lines.uncertainty, -1.0)[RowsById(int_ids(like.lines.ids)).of(lines.ids)]
     start = np.searchsorted(seen.line_idx[order], np.arange(len(lines) + 1))
     return Lines3d(lines.ids.astype("<u8"), lines.segments, uncertainty, start, track)
 
@@ -147,7 +147,7 @@ def _groups_3d(scene: Scene, kind: int, ids: list[int], params: FloatArray, like
 def _weighted(ids: IntArray, before: Records) -> Records:
     members = np.zeros(len(ids), MEMBER_3D)
     members["id"] = ids
-    row = Rows(before["id"].astype(np.int64)).of(ids)
+    row = RowsById(before["id"].astype(np.int64)).of(ids)
     members["weight"] = np.append(before["weight"], 1.0)[row]
     return members
 
@@ -182,7 +182,7 @@ def _groups_2d(
     number = numbered_keypoints(scene)[2][: len(points)]
     by_point = _Inverse(points.point_idx, scene.num_points)
     by_line = _Inverse(seen.line_idx, scene.num_lines)
-    point_row, line_row = Rows(scene.points.ids), Rows(scene.lines.ids)
+    point_row, line_row = RowsById(scene.points.ids), RowsById(scene.lines.ids)
     for group in groups:
         if group.id in known:
             continue
@@ -263,7 +263,7 @@ def group_ids(scene: Scene, taken: tuple[int, ...]) -> tuple[list[int], list[int
     return result[0], result[1]
 
 
-class Rows:
+class RowsById:
     """Rows by identifier."""
 
     def __init__(self, ids: IntArray) -> None:

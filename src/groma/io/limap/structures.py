@@ -58,7 +58,7 @@ from groma.io.limap.files import (
     Structure2d,
     Structures,
 )
-from groma.io.limap.from_scene import Rows, from_scene, group_ids, int_ids
+from groma.io.limap.from_scene import RowsById, from_scene, group_ids, int_ids
 from groma.io.limap.read import read_files
 from groma.io.limap.write import write_files
 from groma.io.reading import existing, reading
@@ -218,8 +218,8 @@ def with_structures(scene: Scene, structures: Structures, exact: Scene | None = 
     exact = Scene() if exact is None else exact
     lines, owner = _lines(structures.lines, exact.lines)
     observations = _observations(scene, structures, owner)
-    point_row = Rows(scene.points.ids)
-    line_row = Rows(lines.ids)
+    point_row = RowsById(scene.points.ids)
+    line_row = RowsById(lines.ids)
     planes = [group for group in structures.groups if group.kind == PLANE]
     directions = [group for group in structures.groups if group.kind == VANISHING_POINT]
     plane_ids, direction_ids = _own_ids(planes, directions, exact)
@@ -242,7 +242,7 @@ def with_structures(scene: Scene, structures: Structures, exact: Scene | None = 
 def _lines(stored: Lines3d, exact: Lines) -> tuple[Lines, IntArray]:
     """Return the usable lines and, for each track element, the row of its line (-1: left out)."""
     ids = int_ids(stored.ids)
-    known = Rows(exact.ids).of(stored.ids)
+    known = RowsById(exact.ids).of(stored.ids)
     same = known >= 0
     same[same] = (exact.segments[known[same]] == stored.segments[same]).all((1, 2))
     usable = same | _has_length(stored.segments)
@@ -265,8 +265,8 @@ def _has_length(segments: FloatArray) -> BoolArray:
 def _observations(scene: Scene, structures: Structures, line_idx: IntArray) -> LineObservations:
     """Return the observations of the tracks, in the order of the images and within them."""
     track = structures.lines.track
-    row = Rows(np.array([image.image_id for image in structures.images], np.int64)).of(track["image_id"])
-    image_idx = Rows(scene.images.ids).of(track["image_id"])
+    row = RowsById(np.array([image.image_id for image in structures.images], np.int64)).of(track["image_id"])
+    image_idx = RowsById(scene.images.ids).of(track["image_id"])
     number = track["idx"].astype(np.int64)
     tables = [image.lines["ends"] for image in structures.images]
     count = np.array([len(table) for table in tables] + [0], np.int64)
@@ -298,7 +298,7 @@ def _unit(groups: list[Group3d], size: int) -> FloatArray:
     return params
 
 
-def _members(groups: list[Group3d], kind: str, rows: Rows) -> IntArray:
+def _members(groups: list[Group3d], kind: str, rows: RowsById) -> IntArray:
     """Return the pairs (member, group) whose member is in the scene."""
     pairs = [np.zeros((0, 2), np.int64)]
     for column, group in enumerate(groups):

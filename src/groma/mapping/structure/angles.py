@@ -122,7 +122,7 @@ def _inside(on: Pairs, along: Pairs, num_planes: int, num_directions: int) -> Bo
 
 
 def _known_by_directions(
-    planes: PlaneSet, directions: DirectionSet, inside: BoolArray, level: float, gates: AngleGates = GATES
+    planes: PlaneSet, directions: DirectionSet, inside: BoolArray, level: float
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Normals (K, 3) and covariances (K, 3, 3), those that say nothing with the directions that lie in their planes.
 
@@ -131,7 +131,7 @@ def _known_by_directions(
     Also returned are the directions (K, D) that were used.
     """
     normals, covariance = planes.planes[:, :3].copy(), planes.covariance[:, :3, :3].copy()
-    inside = inside & (np.linalg.eigvalsh(covariance)[:, -1] > gates.known**2)[:, None]
+    inside = inside & (np.linalg.eigvalsh(covariance)[:, -1] > GATES.known**2)[:, None]
     for k in np.flatnonzero(inside.any(axis=1)).tolist():
         normal, of = normals[k], np.flatnonzero(inside[k])
         axes, vectors = np.stack(perpendicular(normal)), directions.vectors[of]

@@ -96,18 +96,14 @@ def scene_freedom(combinations: FloatArray) -> list[str]:
         rest = Q
     words = []
     shifts, turns = split(rest[:6]) if rest.shape[1] else (np.zeros((3, 0)), np.zeros((3, 0)))
-    if shifts.shape[1] == 3:
-        words.append("translation")
-    elif shifts.shape[1] == 2:
-        words.append(f"translation perpendicular to {axis(np.cross(shifts[:, 0], shifts[:, 1]))}")
-    elif shifts.shape[1] == 1:
-        words.append(f"translation along {axis(shifts[:, 0])}")
-    if turns.shape[1] == 3:
-        words.append("rotation")
-    elif turns.shape[1] == 2:
-        words.append(f"rotation about every axis perpendicular to {axis(np.cross(turns[:, 0], turns[:, 1]))}")
-    elif turns.shape[1] == 1:
-        words.append(f"rotation about {axis(turns[:, 0])}")
+    motions = ("translation", shifts, "", "along "), ("rotation", turns, "about every axis ", "about ")
+    for name, moved, plane, line in motions:
+        if moved.shape[1] == 3:
+            words.append(name)
+        elif moved.shape[1] == 2:
+            words.append(f"{name} {plane}perpendicular to {axis(np.cross(moved[:, 0], moved[:, 1]))}")
+        elif moved.shape[1] == 1:
+            words.append(f"{name} {line}{axis(moved[:, 0])}")
     return words + (["scale"] if scaling else [])
 
 

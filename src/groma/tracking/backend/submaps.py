@@ -48,7 +48,7 @@ class Joint:
 
 
 @dataclass(frozen=True)
-class Places:
+class PlacedMaps:
     """Maps, some of them put into others."""
 
     maps: tuple[TrackMap, ...]
@@ -56,11 +56,11 @@ class Places:
     where: tuple[tuple[int, int], ...]
 
     @classmethod
-    def apart(cls, maps: Sequence[TrackMap]) -> Places:
+    def apart(cls, maps: Sequence[TrackMap]) -> PlacedMaps:
         """Return maps of which each is on its own."""
         return cls(tuple(maps), tuple((k, 0) for k in range(len(maps))))
 
-    def joined(self, joint: Joint) -> Places:
+    def joined(self, joint: Joint) -> PlacedMaps:
         """Put the map of one side of a joint into that of the other; where both are in one map, it is a loop."""
         (root, before), (other, after) = self.where[joint.older], self.where[joint.newer]
         old, new, relative = before + joint.keyframe, after + joint.newest, joint.keyframe_from_newest
@@ -79,7 +79,7 @@ class Places:
             new += shift
         joined.loops.append((old, new, relative))
         join_points(joined, joined.keyframes[old], joined.keyframes[new], first, second)
-        return Places((*self.maps[:root], joined, *self.maps[root + 1 :]), where)
+        return PlacedMaps((*self.maps[:root], joined, *self.maps[root + 1 :]), where)
 
 
 def search_older_maps(maps: list[TrackMap], newest: Keyframe, gates: TrackingGates) -> LoopSearch | None:
@@ -191,7 +191,7 @@ def about_submaps(breaks: list[tuple[float, float]], where: Sequence[tuple[int, 
     breaks
         Times of losses, and of the new maps.
     where
-        Of :class:`Places`.
+        Of :class:`PlacedMaps`.
     others
         Number of frames of each submap that is not the longest.
     """

@@ -235,12 +235,7 @@ def _align(
 
 
 def surroundings_agree(
-    before: SmallImage,
-    now: SmallImage,
-    shape: tuple[int, int],
-    pixels: FloatArray,
-    guesses: FloatArray,
-    noise: float = IMAGES.noise**2,
+    before: SmallImage, now: SmallImage, shape: tuple[int, int], pixels: FloatArray, guesses: FloatArray
 ) -> tuple[float, float]:
     """Correlation of the surroundings of places in the first image with those of guesses in the second.
 
@@ -253,7 +248,7 @@ def surroundings_agree(
     if 4 * inside.sum() < len(pixels):
         return -1.0, -1.0
     scale = np.array([width / shape[1], height / shape[0]])
-    each = np.zeros(int(inside.sum()))
+    each, noise = np.zeros(int(inside.sum())), IMAGES.noise**2
     together = _correlate(before, now, pixels[inside] * scale - 0.5, guesses[inside] * scale - 0.5, noise, each)
     return float(np.median(each)), float(together)
 

@@ -320,7 +320,7 @@ class PoseSearch:
         return Found(estimate, self.known, agree, lines.take(estimate.lines), score, share)
 
 
-class Places:
+class PlacesOnly:
     """Just the places of points, where an estimate wants a table of them."""
 
     def __init__(self, xyz: FloatArray) -> None:
@@ -335,7 +335,7 @@ def _temporary_points(known: KnownFeatures, pairs: IntArray, data: FrameFeatures
     depth_sigma = data.depth_sigma(depth)
     unknown = np.full((count, 2), np.nan)
     table = PointMeasurements(np.arange(count), data.features.pixel[rows], sigma, depth, depth_sigma, unknown)
-    return Places(known.places[pairs[:, 0]]), table
+    return PlacesOnly(known.places[pairs[:, 0]]), table
 
 
 def promote(track_map: TrackMap, found: Found, data: FrameFeatures) -> PointTracks:
