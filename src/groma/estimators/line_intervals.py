@@ -46,10 +46,12 @@ _LINES_AT_ONCE = 512
 
 @kernel
 def _joined(image, low, high, size, same_end):
-    """Join the segments of one image across gaps within the noise of ends; return image, start, end of each piece."""
+    """Join the segments of one image across gaps within the noise of ends.
+
+    Return start and end of each piece, in turn, and 1 for each that is the outermost of its image, else 0.
+    """
     count = len(image)
-    owner, first, last = np.empty(count, np.int64), np.empty(count), np.empty(count)
-    order = np.empty(count, np.int64)
+    order, cuts, is_outer = np.empty(count, np.int64), np.empty(2 * count), np.empty(2 * count, np.int64)
     for k in range(count):  # they are few, and mostly come by image
         m = k
         while m > 0:
@@ -60,58 +62,32 @@ def _joined(image, low, high, size, same_end):
             m -= 1
         order[m] = k
     found = 0
-    for k in order:
-        if found and owner[found - 1] == image[k] and low[k] <= last[found - 1] + same_end * size[k]:
-            last[found - 1] = max(last[found - 1], high[k])
-        else:
-            owner[found], first[found], last[found] = image[k], low[k], high[k]
-            found += 1
-    return owner[:found], first[:found], last[:found]
+    for m in range(count):
+        k = order[m]
+        goes_on = m > 0 and image[order[m - 1]] == image[k]
+        if goes_on and low[k] <= cuts[found - 1] + same_end * size[k]:
+            cuts[found - 1] = max(cuts[found - 1], high[k])
+            continue
+        if goes_on:
+            is_outer[found - 1] = 0
+        cuts[found], cuts[found + 1] = low[k], high[k]
+        is_outer[found], is_outer[found + 1] = not goes_on, 1
+        found += 2
+    return cuts[:found], is_outer
 
 
 @kernel
-def _votes(owner, first, last, place):
-    """Count the images that show a place, and those that deny it; pieces come by image."""
-    shown = denied = 0
-    k = 0
-    while k < len(owner):
-        here = before = after = False
-        begin = k
-        while k < len(owner) and owner[k] == owner[begin]:
-            here = here or (first[k] <= place and place <= last[k])
-            before = before or last[k] < place
-            after = after or first[k] > place
-            k += 1
-        if here:
-            shown += 1
-        elif before and after:
-            denied += 1
-    return shown, denied
-
-
-@kernel
-def _num_ended(owner, first, last, place, noise):
-    """Count the images that show a line on one side of a place only and end at the same place, the most that do."""
-    ends = np.empty(len(owner))
-    found = k = 0
-    while k < len(owner):
-        low, high = first[k], last[k]
-        begin = k
-        while k < len(owner) and owner[k] == owner[begin]:
-            low, high = min(low, first[k]), max(high, last[k])
-            k += 1
-        if high < place:
-            ends[found] = high
+def _num_ended(cuts, is_outer, order, here, ends, noise):
+    """Count the images that show a line on one side of a cut only and end at the same place, the most that do."""
+    most = start = found = 0
+    for m in range(len(order)):
+        k = order[m]
+        if is_outer[k] and (k % 2 == 1) == (m <= here):
+            ends[found] = cuts[k]
             found += 1
-        elif low > place:
-            ends[found] = low
-            found += 1
-    order = ascending(ends[:found])
-    most = start = 0
-    for k in range(found):
-        while ends[order[k]] - ends[order[start]] > 2.0 * noise:
-            start += 1
-        most = max(most, k - start + 1)
+            while cuts[k] - ends[start] > 2.0 * noise:
+                start += 1
+            most = max(most, found - start)
     return most
 
 
@@ -119,19 +95,19 @@ def _num_ended(owner, first, last, place, noise):
 def _intervals(image, low, high, size, gates, begins, ends):
     """Write the supported intervals of a line between 0 and 1; return their number."""
     same_end, majority, most_ended = gates
-    owner, first, last = _joined(image, low, high, size, same_end)
+    cuts, is_outer = _joined(image, low, high, size, same_end)
     noise = same_end * median(size)
-    cuts = np.empty(2 * len(first))
-    for k in range(len(first)):
-        cuts[2 * k], cuts[2 * k + 1] = first[k], last[k]
-    order = ascending(cuts)
+    order, near = ascending(cuts), np.empty(len(cuts))
     found, bridged = 0, False
+    shown = spanned = 0  # images that show the place after a cut, and those that show it or both of its sides
     for k in range(len(cuts) - 1):
+        step = 1 - 2 * (order[k] % 2)
+        shown += step
+        spanned += step * is_outer[order[k]]
         begin, end = max(cuts[order[k]], 0.0), min(cuts[order[k + 1]], 1.0)
         if not begin < end:
             continue
-        shown, denied = _votes(owner, first, last, 0.5 * (begin + end))
-        ended = _num_ended(owner, first, last, 0.5 * (begin + end), noise)
+        denied, ended = spanned - shown, _num_ended(cuts, is_outer, order, k, near, noise)
         if shown >= _MIN_IMAGES and denied < majority * shown and ended < most_ended * shown:
             if found and (bridged or begin - ends[found - 1] <= noise):
                 ends[found - 1] = end
