@@ -14,7 +14,7 @@ from _scene import exact_scene
 from groma.cli.main import run
 from groma.errors import InputError, OutputError
 from groma.io import write_scene
-from groma.scene import Directions, Relations, Scene
+from groma.scene import Directions, Planes, Relations, Scene
 from groma.scene.synthetic.scenes import holistic
 from groma.viz.drawable import drawable
 from groma.viz.pictures import jpeg_address
@@ -302,3 +302,12 @@ def test_the_first_image_is_the_one_with_most_lines(tmp_path):
         {"photo": photo, "lines_seen": n, "points_seen": 0} for photo, n in (("", 9), ("data:", 2), ("data:", 3))
     ]
     assert _page_images._first(entries) == 2
+
+
+def test_planes_with_nothing_on_them_are_counted_not_listed(tmp_path):
+    scene = exact_scene()
+    both = scene.replace(planes=Planes([1, 77], np.concatenate([scene.planes.hesse, [[1.0, 0.0, 0.0, 2.0]]])))
+    text = write_page(tmp_path, None, both)
+    assert "Not listed: 1 plane with nothing of this scene on them." in text and "</i>77</td>" not in text
+    nothing = scene.replace(relations=Relations())
+    assert "<h2>Planes</h2>" not in write_page(tmp_path, None, nothing)

@@ -102,9 +102,13 @@ def row_of(one: StoredImage) -> tuple[str, ...]:
     """Return a row of the table with the head :data:`COLUMNS`."""
     numbers = one.to_dict()
     sigma, turn = numbers["center_sigma"], numbers["rotation_sigma_deg"]
-    center = "" if sigma is None else f"{sum(value * value for value in sigma) ** 0.5:.2g}"
+    center = "" if sigma is None else _two_digits(sum(value * value for value in sigma) ** 0.5)
     seen = (f"{numbers['num_point_inliers']:,}", f"{numbers['num_line_inliers']:,}")
-    return one.name, one.status, *seen, center, "" if turn is None else f"{turn:.2g}°"
+    return one.name, one.status, *seen, center, "" if turn is None else f"{_two_digits(turn)}°"
+
+
+def _two_digits(value: float) -> str:
+    return f"{value:#.2g}".rstrip(".")
 
 
 def _table(queries: Sequence[StoredImage]) -> str:

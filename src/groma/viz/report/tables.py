@@ -264,9 +264,10 @@ def _residual_table(before: Drawable | None, after: Drawable) -> str:
 
 
 def _plane_table(scene: Scene, after: Drawable) -> str:
-    if not scene.num_planes:
+    held = int(np.count_nonzero(after.patch_members))  # planes without members have neither area nor distance
+    if not held:
         return ""
-    order = np.argsort(-after.patch_members, kind="stable")[:MAX_LISTED_PLANES]
+    order = np.argsort(-after.patch_members, kind="stable")[: min(held, MAX_LISTED_PLANES)]
     colours = PALETTE[patch_groups(after.patch_members)]
     rows: list[list[str]] = []
     areas, far_off = [], []
@@ -283,10 +284,10 @@ def _plane_table(scene: Scene, after: Drawable) -> str:
     for row, area, far in zip(rows, _digits.even(areas), _digits.even(far_off), strict=True):
         row += [area, far]
     marks = [_colours.css(colours[plane]) for plane in order]
-    left = scene.num_planes - len(order)
-    caption = "Area of what lies on them, and rms distance of it, in scene units." + (
-        f" The {len(order)} with most on them; {left:,} more are in the scene." if left else ""
-    )
+    left, bare = held - len(order), scene.num_planes - held
+    caption = "Area of what lies on them, and rms distance of it, in scene units."
+    caption += f" The {len(order)} with most on them; {left:,} more are in the scene." if left else ""
+    caption += f" Not listed: {counted(bare, 'planes')} with nothing of this scene on them." if bare else ""
     return table("Planes", caption, ["plane", "points", "lines", "area", "distance"], rows, marks)
 
 
