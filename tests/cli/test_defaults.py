@@ -5,10 +5,13 @@ from __future__ import annotations
 
 import importlib
 import inspect
+from typing import get_args
 
 import pytest
 
+from groma.cli.commands import evaluate
 from groma.evaluation.gates import SCORES
+from groma.io import trajectories
 from groma.localization.localizer import LocalizeOptions
 from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.options import MapOptions
@@ -41,3 +44,7 @@ def test_commands_have_the_defaults_of_what_they_call(command, argument, there):
 
 def test_photographs_are_placed_with_the_steps_of_a_map():
     assert _default(register_photographs, "max_iterations") == MapOptions().max_iterations
+
+
+def test_evaluate_takes_the_trajectory_formats_that_are_read():
+    assert set(get_args(evaluate._Format)) == {"auto", *trajectories._FORMATS}

@@ -375,6 +375,8 @@ def test_what_is_no_sequence(tmp_path):
     with pytest.raises(InputError, match="neither a folder nor a video"):
         open_sequence(tmp_path / "x.dat")
     image(tmp_path / "bad/0.png", 1)
+    with pytest.raises(InputError, match=r"no sequence.*It contains sequences: bad\."):
+        open_sequence(tmp_path)
     (tmp_path / "bad/0.png").write_bytes(b"x")
     with pytest.raises(InputError, match="None of the 1 images"):
         open_sequence(tmp_path / "bad", camera="50 50 32 24")

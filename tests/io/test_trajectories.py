@@ -100,8 +100,12 @@ def test_matrices_of_redwood(tmp_path):
     read = read_trajectory(tmp_path / "t.log")
     np.testing.assert_allclose(read.world_from_cam, [[0, 0, np.sqrt(0.5), np.sqrt(0.5), 4, 5, 6]] * 2, atol=1e-15)
     assert read.timestamps.tolist() == [0, 1]
-    with pytest.raises(FileFormatError, match="is not a scene"):  # three whole numbers begin BAL files, too
+    # Three whole numbers begin BAL files, too.
+    with pytest.raises(FileFormatError, match=r"is a trajectory, not a scene.*groma evaluate trajectory"):
         read_scene(tmp_path / "t.log")
+    (tmp_path / "cut.log").write_text(LOG[:-9])
+    with pytest.raises(FileFormatError, match="is not a scene: expected"):
+        read_scene(tmp_path / "cut.log")
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from groma.errors import FileFormatError, InputError
+from groma.errors import FileFormatError, GromaError, InputError
 from groma.io.g2o import looks_like_g2o
 from groma.io.reading import existing, reading
+from groma.io.trajectories import read_trajectory
 from groma.scene import Scene
 from groma.scene.checks import check_scene_given
 
@@ -118,8 +119,21 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
         return colmap(place)  # its error names the missing files
     if looks_like_g2o(head):
         raise FileFormatError(f"{place} is a pose graph, not a scene. Optimise it with groma adjust.")
+    if _is_trajectory(place):
+        raise FileFormatError(
+            f"{place} is a trajectory, not a scene. Compare it with another by groma evaluate trajectory, or take its "
+            "poses for photographs with groma map --poses."
+        )
     begin = f"begins with {head[:20].decode(errors='backslashreplace')!r}" if head else "is empty"
     raise FileFormatError(f"{place} is not a scene: expected {_sources(readable)}; it {begin}.")
+
+
+def _is_trajectory(place: Path) -> bool:
+    try:
+        read_trajectory(place)
+    except GromaError:
+        return False
+    return True
 
 
 def write_scene(

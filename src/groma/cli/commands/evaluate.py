@@ -14,7 +14,7 @@ from groma.cli.shared.input import check_inputs, refuse_idle
 from groma.errors import InputError
 
 # Repeated from groma.io.trajectories and groma.evaluation.trajectory, whose import would load NumPy.
-_Format = Literal["auto", "tum", "kitti", "euroc"]
+_Format = Literal["auto", "tum", "kitti", "euroc", "log"]
 _Alignment = Literal["se3", "sim3", "none"]
 _StepUnit = Literal["frames", "metres", "seconds"]
 _MAX_ANGLE, _MAX_TIME = 10.0, 0.01  # derived from groma.evaluation.gates.SCORES

@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+from groma._counted import first_of
 from groma.bounded.names import VIDEOS
 from groma.errors import InputError
 from groma.io.reading import existing
@@ -78,8 +79,11 @@ def open_sequence(
             return layout.open(root, wishes)
     if not place.is_dir():
         raise InputError(f"{place} is neither a folder nor a video ({', '.join(VIDEOS)}). Pass the sequence's folder.")
+    readable = (one for one in sorted(place.iterdir()) if os.access(one, os.R_OK))
+    inner = [one.name for one in readable if any(layout.find(one) for layout in layouts())]
+    hint = f"It contains sequences: {first_of(inner, 3)}." if inner else "Check the path."
     signs = ", ".join(layout.sign for layout in layouts() if layout.sign)
-    raise InputError(f"{place} is no sequence that groma knows: expected {signs}, or images. Check the path.")
+    raise InputError(f"{place} is no sequence that groma knows: expected {signs}, or images. {hint}")
 
 
 def _here(has_layout: Callable[[Path], object]) -> Callable[[Path], Path | None]:
