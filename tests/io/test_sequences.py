@@ -368,12 +368,10 @@ def test_video(tmp_path):
 
 
 def test_what_is_no_sequence(tmp_path):
-    for path, words in ((tmp_path, "no sequence"), (tmp_path / "none", "Cannot read")):
-        with pytest.raises(InputError, match=words):
-            open_sequence(path)
     (tmp_path / "x.dat").write_text("x")
-    with pytest.raises(InputError, match="neither a folder nor a video"):
-        open_sequence(tmp_path / "x.dat")
+    for name, words in ((".", "no sequence"), ("none", "Cannot read"), ("x.dat", "neither a folder nor a video")):
+        with pytest.raises(InputError, match=words):
+            open_sequence(tmp_path / name)
     image(tmp_path / "bad/0.png", 1)
     with pytest.raises(InputError, match=r"no sequence.*It contains sequences: bad\."):
         open_sequence(tmp_path)
