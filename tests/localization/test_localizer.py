@@ -344,7 +344,7 @@ def test_command(place, localizer, tmp_path, capsys):
     assert model.cam_centers_in_world[image] == pytest.approx(told[right[0]]["center"], abs=1e-6)
     page = (out / "report.html").read_text()
     assert f'<td class="words">{told["black.png"]["sentence"]}' in page
-    assert f"<td>{told[right[0]]['rotation_sigma_deg']:.2g}°</td>" in page
+    assert f'<td data-name="rotation">{told[right[0]]["rotation_sigma_deg"]:.2g}°</td>' in page
     assert not out.with_name("out.work").exists()
 
 

@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 from _scene import exact_scene
 
+from groma.geometry import se3
+from groma.localization.result import card_of
+from groma.localization.stored import StoredImage
 from groma.viz.report.covariances import LandmarkCovariances
 from groma.viz.report.page import PageContents, write_report
 
@@ -72,7 +75,13 @@ def report(tmp_path_factory, scene, covariances):
     folder = tmp_path_factory.mktemp("report")
     for name in scene.images.names:
         cv2.imwrite(str(folder / name), np.full((480, 640, 3), 120, np.uint8))
-    write_report(folder / "page.html", None, scene, images=folder, contents=PageContents(covariances=covariances))
+    none = np.zeros(0, int)
+    query = StoredImage(
+        "street/0001.jpg", "localized", "A sentence about it.", se3.identity(1)[0], 0.01 * np.eye(6), "PINHOLE",
+        np.ones(4), np.ones(2, int), none, np.zeros((0, 2)), none, np.zeros((0, 4)), 0.0,
+    )  # fmt: skip
+    contents = PageContents(cards=card_of([query]), covariances=covariances)
+    write_report(folder / "page.html", None, scene, images=folder, contents=contents)
     return (folder / "page.html").as_uri()
 
 
@@ -309,6 +318,10 @@ def test_a_phone(opened, scene):
     """Nothing wider than the screen, the scene without scrolling past numbers, taps that choose."""
     page = opened(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True, device_scale_factor=2)
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    localised = page.locator(".card.wide td")
+    assert localised.count() == 7 and all(
+        box["x"] + box["width"] <= 390 for box in (cell.bounding_box() for cell in localised.all())
+    )
     box = page.locator("#scene").bounding_box()
     assert box["width"] > 300 and box["height"] >= 300 and box["y"] + box["height"] < 844
     _only(page, "lines")

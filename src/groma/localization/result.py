@@ -87,7 +87,7 @@ class LocalizeResult:
             write_scene(self.scene(), draft, format="colmap")
             (draft / "poses.txt").write_text(self.poses(), encoding="utf-8")
             (draft / "localized.json").write_text(json_text(self.to_dict()), encoding="utf-8")
-            contents = PageContents(cards=_table(self.queries))
+            contents = PageContents(cards=card_of(self.queries))
             alone = self.scene(of_map=False)
             named = {name: files[self._query_of(name)] for name in alone.images.names}
             shown = alone if alone.num_images else self.map
@@ -111,17 +111,16 @@ def _two_digits(value: float) -> str:
     return f"{value:#.2g}".rstrip(".")
 
 
-def _table(queries: Sequence[StoredImage]) -> str:
-    """The queries as a card of the page."""
+def card_of(queries: Sequence[StoredImage]) -> str:
+    """Return the queries as a card of the page; where it is narrow, each is a block whose numbers bear their names."""
     rows = []
     for one in queries:
         name, *cells = row_of(one)
-        told = "".join(f"<td>{cell}</td>" for cell in cells)
+        told = "".join(f'<td data-name="{column}">{cell}</td>' for column, cell in zip(COLUMNS[1:], cells, strict=True))
         words = html.escape(one.sentence)
         rows.append(f'<tr><td class="name">{html.escape(name)}</td>{told}<td class="words">{words}</td></tr>')
     head = "".join(f"<th>{name}</th>" for name in COLUMNS)
     count = sum(one.status == "localized" for one in queries)
-    head = "".join(f"<th>{name}</th>" for name in COLUMNS)
     return (
         '<section class="card wide"><h2>Photographs</h2><p class="caption">'
         f"{count} of {counted(len(queries), 'photographs')} localised. "
