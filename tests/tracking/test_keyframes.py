@@ -188,7 +188,7 @@ def test_measurements_of_keyframes_are_stacked_under_the_numbers_of_today():
             PointMeasurements(np.array(points), two, one, one, one, two), LineMeasurements.empty(),
             PlaneMeasurements(np.array(planes), np.zeros((len(planes), 4)), np.zeros((len(planes), 3, 3))),
         )  # fmt: skip
-        return Keyframe(0, 0.0, "", se3.identity(), np.zeros((0, 0)), measured, Features.none(), np.zeros(0))
+        return Keyframe(0, 0.0, "", se3.identity(), np.zeros((0, 0), np.uint8), measured, Features.none(), np.zeros(0))
 
     measured, of, row = stacked(track_map, [keyframe([1, 2, 0], [2, 0]), keyframe([0, 1], [3, 1])])
     points = np.column_stack([measured.points.index, of["points"], row["points"]])
