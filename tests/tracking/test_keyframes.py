@@ -15,9 +15,10 @@ from groma.tracking.backend.loop_closure import LoopSearch
 from groma.tracking.backend.mapper import Mapper
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.features import Features, describe
-from groma.tracking.frame.measurements import Measurements
+from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
 from groma.tracking.map.culling import drop_unseen
-from groma.tracking.map.landmarks import ALIVE
+from groma.tracking.map.landmarks import ALIVE, DEAD
+from groma.tracking.map.map_scene import stacked
 from groma.tracking.map.points import PointTracks, find_again
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.pose.verification import PoseVerification, misses_much
@@ -157,7 +158,7 @@ def test_points_that_are_not_found_are_looked_for_ever_more_rarely(monkeypatch):
     track_map.keyframes.append(Keyframe(0, 0.0, "0", pose, image, Measurements.empty(), Features.none(), np.zeros(0)))
     asked = []
 
-    def follow(_before, _now, _pixels, guesses, levels):
+    def follow(_before, _now, _pixels, guesses, levels, max_shift):
         """Only the first is ever found."""
         asked.append(len(guesses))
         return guesses, guesses[:, 0] < 100
@@ -170,6 +171,32 @@ def test_points_that_are_not_found_are_looked_for_ever_more_rarely(monkeypatch):
     assert track_map.points.misses.tolist() == [0, 13, 13]
     drop_unseen(track_map, gates.max_misses)
     assert track_map.points.alive.tolist() == [True, False, False]
+
+
+def test_measurements_of_keyframes_are_stacked_under_the_numbers_of_today():
+    """Landmarks that are gone are left out; a plane that was merged twice has the number that is left."""
+    track_map = TrackMap()
+    track_map.points.extend(3)
+    track_map.points.state[:] = [ALIVE, DEAD, ALIVE]
+    track_map.planes.extend(4)
+    track_map.planes.state[:] = [DEAD, DEAD, ALIVE, DEAD]
+    track_map.planes.merged_into[:2] = [1, 2]
+
+    def keyframe(points: list[int], planes: list[int]) -> Keyframe:
+        one, two = np.zeros(len(points)), np.zeros((len(points), 2))
+        measured = Measurements(
+            PointMeasurements(np.array(points), two, one, one, one, two), LineMeasurements.empty(),
+            PlaneMeasurements(np.array(planes), np.zeros((len(planes), 4)), np.zeros((len(planes), 3, 3))),
+        )  # fmt: skip
+        return Keyframe(0, 0.0, "", se3.identity(), np.zeros((0, 0), np.uint8), measured, Features.none(), np.zeros(0))
+
+    measured, of, row = stacked(track_map, [keyframe([1, 2, 0], [2, 0]), keyframe([0, 1], [3, 1])])
+    points = np.column_stack([measured.points.index, of["points"], row["points"]])
+    assert points.tolist() == [[2, 0, 1], [0, 0, 2], [0, 1, 0]]
+    planes = np.column_stack([measured.planes.index, of["planes"], row["planes"]])
+    assert planes.tolist() == [[2, 0, 0], [2, 0, 1], [2, 1, 1]]
+    assert len(measured.lines) == len(of["lines"]) == 0
+    assert len(stacked(track_map, [])[0].points) == 0
 
 
 def test_a_pose_that_most_points_do_not_agree_with_is_in_doubt():

@@ -32,6 +32,19 @@ def test_texture_is_followed():
     assert np.quantile(error, 0.95) < 0.5
 
 
+def test_points_far_from_where_they_are_expected_are_given_up():
+    image = _noisy(_texture(0), 2.0, 1)
+    pixels = corners(image, 50, 10)
+    pixels = pixels[((pixels > 20) & (pixels < (300, 220))).all(axis=1)]
+    guess = pixels + np.where(np.arange(len(pixels)) % 2, 5.0, 1.0)[:, None]
+    there, good = follow(image, image, pixels, guess)
+    bounded, near = follow(image, image, pixels, guess, max_shift=4.0)
+    assert good.mean() > 0.9
+    np.testing.assert_array_equal(bounded, there)
+    np.testing.assert_array_equal(near, good & (np.arange(len(pixels)) % 2 == 0))
+    assert not follow(image, image, pixels, max_shift=0.0)[1].any()
+
+
 @pytest.mark.parametrize("sigma", [1.0, 2.0, 4.0])
 def test_noise_is_not_followed(sigma):
     """On a plain wall every point would stay where it was expected, and confirm it."""

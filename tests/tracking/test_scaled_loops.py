@@ -9,6 +9,7 @@ from groma.geometry import se3, sim3
 from groma.tracking import Tracker, TrackOptions
 from groma.tracking.backend.loop_closure import move
 from groma.tracking.backend.scaled_loops import close_scaled_loops
+from groma.tracking.map.map_scene import stacked
 
 #: Few points, so that a lap of a few seconds drifts.
 FEW = {"num_points": 100, "lines": False}
@@ -92,7 +93,7 @@ def _no_segment_tells_two_lines(tracker: Tracker) -> None:
     """Lines that were joined are measured once in each keyframe, and the oldest keyframes' lines are seen again."""
     ages = {}
     for keyframe in tracker.map.living():
-        index = tracker.map.living_measurements(keyframe).lines.index
+        index = stacked(tracker.map, [keyframe])[0].lines.index
         assert len(np.unique(index)) == len(index)
         for line in index.tolist():
             ages.setdefault(line, []).append(keyframe.index)

@@ -78,6 +78,7 @@ def follow(
     levels: int = 3,  # convention: of OpenCV
     window: int = 15,
     round_trip: float | None = 1.0,
+    max_shift: float = math.inf,
 ) -> tuple[FloatArray, BoolArray]:
     """Where points of the first image are in the second.
 
@@ -95,6 +96,8 @@ def follow(
         Width of the compared patches, pixels.
     round_trip : float, optional
         Maximum forward-backward error, pixels; None: no backward pass.
+    max_shift : float
+        Points found this far from where they were expected are given up, before the backward pass; pixels.
 
     Returns
     -------
@@ -118,6 +121,8 @@ def follow(
     height, width = image_2.shape
     with np.errstate(invalid="ignore"):
         good &= ((there >= 0) & (there <= (width - 1, height - 1))).all(axis=1)
+        expected = pixels if guesses is None else guesses
+        good &= np.linalg.norm(there.astype(np.float64) + 0.5 - expected, axis=1) < max_shift
     if good.any():
         rows = np.flatnonzero(good)
         good[rows] = _alike(image_1, image_2, start[rows], there[rows], window) > POINT_TRACKS.min_alike

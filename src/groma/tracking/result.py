@@ -39,7 +39,7 @@ def map_to_scene(track_map: TrackMap, camera: TrackCamera, relations: bool = Tru
         name = keyframe.name or f"{keyframe.index:06d}"
         names.append(name if name not in used else f"{keyframe.index:06d}_{name}")
         used.add(names[-1])
-    measured, image = stacked(track_map, living)
+    measured, image, _ = stacked(track_map, living)
     often = np.bincount(measured.points.index, minlength=len(track_map.points)) >= min(min_views, len(living))
     keep = often[measured.points.index]
     points = Seen.of(measured.points.take(keep), image["points"][keep])

@@ -27,13 +27,15 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.adjustment.assemble import assemble
 from groma.gates import NORMAL, SIGMA_OF_MEDIAN
+from groma.geometry import se3
 from groma.problem.problem import Problem
 from groma.problem.residuals import squared_norms
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 from groma.tracking.backend.local_adjustment import job_of
-from groma.tracking.frame.camera import TrackCamera, into
+from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.gates import DepthGates
+from groma.tracking.map.map_scene import stacked
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.options import TrackOptions
 
@@ -104,14 +106,12 @@ def depths_that_do_not_fit(track_map: TrackMap, gates: DepthGates) -> list[str]:
     The median deviation tells: depths beside edges, up to a tenth of all, are off in good sequences, too.
     """
     living, points = track_map.living(), track_map.points
-    tables = [track_map.living_measurements(keyframe).points for keyframe in living]
-    seen = np.bincount(np.concatenate([table.index for table in tables]), minlength=len(points))
-    off = []
-    for keyframe, table in zip(living, tables, strict=True):
-        told = np.isfinite(table.depth) & (seen[table.index] >= 3)
-        depth = into(keyframe.pose, points.xyz[table.index[told]])[:, 2]
-        off.append(np.abs(depth - table.depth[told]) / table.depth_sigma[told])
-    every = np.concatenate(off)
+    measured, image, _ = stacked(track_map, living)
+    table, poses = measured.points, np.array([keyframe.pose for keyframe in living])
+    seen = np.bincount(table.index, minlength=len(points))
+    told = np.flatnonzero(np.isfinite(table.depth) & (seen[table.index] >= 3))
+    depth = se3.transform_points(poses[image["points"][told]], points.xyz[table.index[told]])[:, 2]
+    every = np.abs(depth - table.depth[told]) / table.depth_sigma[told]
     median = float(np.median(every)) if len(every) >= NORMAL.sample else 0.0
     if SIGMA_OF_MEDIAN * median <= gates.max_misfit:
         return []

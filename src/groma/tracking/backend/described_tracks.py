@@ -60,8 +60,9 @@ def _matched(
     if len(first) < gates.rectification.min_pairs or one.gray is None or two.gray is None:
         return first[:0], second[:0], np.zeros((0, 2))
     guess = two.features.pixel[second]
-    there, good = follow(one.gray, two.gray, pixel[first], guess, levels=0, round_trip=None)
-    good &= np.linalg.norm(there - guess, axis=1) < POINT_TRACKS.max_shift
+    there, good = follow(
+        one.gray, two.gray, pixel[first], guess, levels=0, round_trip=None, max_shift=POINT_TRACKS.max_shift
+    )
     if good.sum() < gates.rectification.min_pairs:
         return first[:0], second[:0], np.zeros((0, 2))
     _, agree = cv2.findEssentialMat(

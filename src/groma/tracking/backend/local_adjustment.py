@@ -23,7 +23,6 @@ from groma.solver.report import SolveReport
 from groma.solver.solve import solve
 from groma.tracking.frame.camera import TrackCamera, back, into
 from groma.tracking.frame.measurements import LineMeasurements, PointMeasurements
-from groma.tracking.map.landmarks import ALIVE
 from groma.tracking.map.lines import line_ends
 from groma.tracking.map.map_scene import TRACKING, Seen, map_scene, stacked
 from groma.tracking.map.relations import find_relations
@@ -196,12 +195,8 @@ def job_of(
     min_views: int = 2,
 ) -> AdjustmentJob | None:
     """Prepare the adjustment of some keyframes and all that at least two, or ``min_views``, of them see."""
-    measured, pose = stacked(track_map, keyframes)
+    measured, pose, in_table = stacked(track_map, keyframes)
     points, lines = measured.points, measured.lines
-    rows = {}
-    for kind, table in (("points", track_map.points), ("lines", track_map.lines)):
-        rows[kind] = [np.flatnonzero(table.state[getattr(k.measured, kind).index] == ALIVE) for k in keyframes]
-    in_table = {kind: np.concatenate(rows[kind]) if rows[kind] else np.zeros(0, np.int64) for kind in rows}
     # Points seen once, or by no free keyframe, do not constrain poses.
     free = ~held
     often = np.bincount(points.index, minlength=len(track_map.points)) >= min_views

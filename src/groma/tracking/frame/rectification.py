@@ -188,8 +188,7 @@ def find_pairs(
     here, guess = _alike(camera, left, right, -_band(camera, gates), gates, features)
     if not len(here):
         return here, guess
-    there, good = follow(left, right, here, guess, levels=0, round_trip=None)
-    good &= np.linalg.norm(there - guess, axis=1) < POINT_TRACKS.max_shift
+    there, good = follow(left, right, here, guess, levels=0, round_trip=None, max_shift=POINT_TRACKS.max_shift)
     return here[good], there[good]
 
 

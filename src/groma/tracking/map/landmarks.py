@@ -116,3 +116,9 @@ class PlaneTable(_Growing):
     def of_landmarks(self) -> BoolArray:
         """Which planes with a place were found in points and lines, not in depth images."""
         return self.alive & (self.found == 0)
+
+    def now(self, index: IntArray) -> IntArray:
+        """Return the numbers of planes (n,) after some were merged into others."""
+        while (merged := self.merged_into[index] >= 0).any():
+            index = np.where(merged, self.merged_into[index], index)
+        return index

@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from groma._rows import numbered
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.stages import METRIC_LOSS, METRIC_RELATION_LOSS
@@ -28,6 +29,7 @@ from groma.scene import (
 from groma.scene.table import Table
 from groma.tracking.frame.camera import PINHOLE, TrackCamera
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
+from groma.tracking.map.landmarks import ALIVE
 from groma.tracking.map.track_map import Keyframe, TrackMap
 
 #: How tracking assembles problems. Points are near and well known, and keep to plain steps.
@@ -59,14 +61,25 @@ class Seen(Generic[_Table]):
         return cls(ids, replace(table, index=np.searchsorted(ids, table.index)), image)
 
 
-def stacked(track_map: TrackMap, keyframes: list[Keyframe]) -> tuple[Measurements, dict[str, IntArray]]:
-    """Return what keyframes measure of living landmarks, one below the other, and by kind the keyframe of each row."""
-    parts = [track_map.living_measurements(keyframe) for keyframe in keyframes]
-    kinds = {"points": PointMeasurements, "lines": LineMeasurements, "planes": PlaneMeasurements}
-    tables = {kind: [getattr(part, kind) for part in parts] for kind in kinds}
-    row = np.arange(len(parts))
-    image: dict[str, IntArray] = {kind: np.repeat(row, [len(table) for table in tables[kind]]) for kind in kinds}
-    return Measurements(**{kind: table.stack(tables[kind]) for kind, table in kinds.items()}), image
+def stacked(
+    track_map: TrackMap, keyframes: list[Keyframe]
+) -> tuple[Measurements, dict[str, IntArray], dict[str, IntArray]]:
+    """Return what keyframes measure of living landmarks, one below the other; merged planes under their new number.
+
+    By kind follow the keyframe of each, and its row in the table of that keyframe.
+    """
+    whole: dict[str, Any] = {}
+    image: dict[str, IntArray] = {}
+    row: dict[str, IntArray] = {}
+    for kind, tables in {"points": PointMeasurements, "lines": LineMeasurements, "planes": PlaneMeasurements}.items():
+        parts = [getattr(keyframe.measured, kind) for keyframe in keyframes]
+        of, place = numbered(np.array([len(part) for part in parts], np.int64))
+        table, landmarks = tables.stack(parts), getattr(track_map, kind)
+        if kind == "planes":
+            table = replace(table, index=track_map.planes.now(table.index))
+        living = np.flatnonzero(landmarks.state[table.index] == ALIVE)
+        whole[kind], image[kind], row[kind] = table.take(living), of[living], place[living]
+    return Measurements(**whole), image, row
 
 
 def map_scene(

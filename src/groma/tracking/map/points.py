@@ -55,8 +55,8 @@ def follow_points(
     own = np.flatnonzero(points.keyframe[tracks.index] == keyframe.index)
     if keyframe.gray is not None and len(own):
         patch = points.pixel[tracks.index[own]]
-        pixel, good = follow(keyframe.gray, now, patch, tracks.pixel[own], levels=0, round_trip=None)
-        good &= np.linalg.norm(pixel - tracks.pixel[own], axis=1) < max_correction
+        expected = tracks.pixel[own]
+        pixel, good = follow(keyframe.gray, now, patch, expected, levels=0, round_trip=None, max_shift=max_correction)
         held = tracks.pixel.copy()
         held[own[good]] = pixel[good]
         tracks = PointTracks(tracks.index, held)
@@ -103,8 +103,8 @@ def find_again(
         of = of[due]
         patch = track_map.keyframes[index].gray
         assert patch is not None
-        there, good = follow(patch, now, points.pixel[rows[of]], pixel[of], levels=1)
-        good &= np.linalg.norm(there - pixel[of], axis=1) < gates.again_radius
+        seen = points.pixel[rows[of]]
+        there, good = follow(patch, now, seen, pixel[of], levels=1, max_shift=gates.again_radius)
         points.misses[rows[of[~good]]] += 1
         points.misses[rows[of[good]]] = 0
         found = found.joined(PointTracks(rows[of[good]], there[good]))

@@ -12,7 +12,7 @@ from groma._typing import FloatArray, IntArray
 from groma.geometry import se3
 from groma.tracking.frame.features import Features
 from groma.tracking.frame.measurements import Measurements
-from groma.tracking.map.landmarks import ALIVE, DEAD, LineTable, PlaneTable, PointTable
+from groma.tracking.map.landmarks import DEAD, LineTable, PlaneTable, PointTable
 
 
 def in_unit(motion: FloatArray, unit: float) -> FloatArray:
@@ -138,20 +138,3 @@ class TrackMap:
     def drop_lines(self, rows: IntArray) -> None:
         """Take lines out of the map."""
         self.lines.state[rows] = DEAD
-
-    def living_measurements(self, keyframe: Keyframe) -> Measurements:
-        """What a keyframe measures of landmarks that are alive; merged planes under their new number."""
-        points, lines, planes = keyframe.measured.points, keyframe.measured.lines, keyframe.measured.planes
-        if len(planes):
-            index = planes.index.copy()
-            for _ in range(8):
-                moved = self.planes.merged_into[index]
-                if (moved < 0).all():
-                    break
-                index = np.where(moved >= 0, moved, index)
-            planes = replace(planes, index=index)
-        return Measurements(
-            points.take(self.points.state[points.index] == ALIVE),
-            lines.take(self.lines.state[lines.index] == ALIVE),
-            planes.take(self.planes.state[planes.index] == ALIVE),
-        )
