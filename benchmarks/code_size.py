@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The size and form of the sources as one table of counts, read from the syntax and not run.
 
-    python benchmarks/code_size.py [--since COMMIT] [--root DIR] [--list ROW] [--rooms]
+    python benchmarks/code_size.py [--since COMMIT] [--root DIR] [--list ROW] [--rooms] [--kept]
 
 ``--since`` shows a commit of this checkout beside it (the state before the house was rebuilt is 961f0a1), ``--root``
-counts another checkout, ``--list`` prints what a row counts, ``--rooms`` the source lines of every room.
+counts another checkout, ``--list`` prints what a row counts, ``--rooms`` the source lines of every room. ``--kept``
+splits the source lines by room: functions and classes of the commit that are still there, then and now, and new ones.
+Two are the same if they have one name, or, where that is gone, more than 55 % of their words in common; each is matched
+once, the most alike first.
 
 ==========================  ==========================================================================================
 Row                         Rule
@@ -30,6 +33,7 @@ from __future__ import annotations
 import argparse
 import ast
 import io
+import re
 import subprocess
 import tarfile
 import tempfile
@@ -44,7 +48,9 @@ import tuned_numbers
 T = TypeVar("T")
 Found: TypeAlias = list[str]
 Function: TypeAlias = ast.FunctionDef | ast.AsyncFunctionDef
-LONG, MANY, RUN = 60, 10, 6
+LONG, MANY, RUN, ALIKE = 60, 10, 6, 0.55
+#: The state before the house was rebuilt.
+BEFORE = "961f0a1"
 #: Decorators of compiled code.
 KERNELS = {"exact_kernel", "inline_kernel", "intrinsic", "kernel", "loop", "unrolled_loop"}
 
@@ -200,6 +206,45 @@ def private_imports(modules: list[Module]) -> Found:
     return found
 
 
+def definitions(root: Path) -> list[tuple[str, str, int, Counter[str]]]:
+    """Return room, name without underscores, source lines and words of the functions and classes of all modules."""
+    found = []
+    for module in modules_of(root):
+        rows = source_rows(module)
+        for node in module.tree.body:
+            if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+                first = min([node.lineno, *(mark.lineno for mark in node.decorator_list)])
+                own = [rows[line] for line in range(first, (node.end_lineno or 0) + 1) if line in rows]
+                words = Counter(word for line in own for word in re.findall(r"\w+", line))
+                found.append((room_of(module), node.name.strip("_"), len(own), words))
+    return found
+
+
+def kept_lines(commit: str, root: Path) -> dict[str, Counter[str]]:
+    """Return the lines of what a commit had and of what is new, by room of today."""
+    then, now = at_commit(commit, root, definitions), definitions(root)
+    names = [{name for _, name, *_ in side} for side in (then, now)]
+    alike = []
+    for i, (_, name, _, words) in enumerate(then):
+        for j, (_, other, _, others) in enumerate(now):
+            if name == other or (name not in names[1] and other not in names[0]):
+                share = 2 * (words & others).total() / (words.total() + others.total())
+                if share > (0.0 if name == other else ALIKE):
+                    alike.append((name == other, share, i, j))
+    pairs: dict[int, int] = {}
+    taken: set[int] = set()
+    for _, _, i, j in sorted(alike, reverse=True):
+        if i not in taken and j not in pairs:
+            pairs[j] = i
+            taken.add(i)
+    rooms: dict[str, Counter[str]] = {}
+    for j, (room, _, lines, _) in enumerate(now):
+        count = rooms.setdefault(room, Counter())
+        count += Counter({"then": then[pairs[j]][2], "now": lines}) if j in pairs else Counter({"new": lines})
+    rooms["gone"] = Counter(then=sum(lines for i, (_, _, lines, _) in enumerate(then) if i not in taken))
+    return rooms
+
+
 def optimiser_loops(modules: list[Module]) -> Found:
     """Functions with a loop that changes a damping."""
 
@@ -302,7 +347,14 @@ def main() -> None:
     parser.add_argument("--since", metavar="COMMIT", help="show a commit of the checkout before it")
     parser.add_argument("--list", metavar="ROW", choices=ROWS, help="print what a row counts")
     parser.add_argument("--rooms", action="store_true", help="print the source lines of every room")
+    parser.add_argument("--kept", action="store_true", help="print what was there in the commit and what is new")
     arguments = parser.parse_args()
+    if arguments.kept:
+        rooms = kept_lines(arguments.since or BEFORE, arguments.root)
+        rooms["all"] = sum(rooms.values(), Counter())
+        print(f"{'':<40}{'then':>8}{'now':>8}{'new':>8}")
+        print(*(f"{room:<40}{n['then']:>8,}{n['now']:>8,}{n['new']:>8,}" for room, n in rooms.items()), sep="\n")
+        return
     if arguments.rooms:
         rooms = Counter()
         for module in modules_of(arguments.root):

@@ -104,3 +104,19 @@ def test_a_commit_is_counted(code_size, tmp_path):
     (room / "thing.py").write_text(ROOM)
     before, after = code_size.counts_of("HEAD", tmp_path), code_size.counts(tmp_path)
     assert before.keys() == after.keys() and (before["files"], after["files"]) == (1, 2)
+
+
+def test_what_a_commit_had_is_told_apart_from_what_is_new(code_size, tmp_path):
+    def write(text):
+        (tmp_path / "src" / "groma").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "src" / "groma" / "room.py").write_text(text)
+
+    same = "def {}(a):\n    b = a + 1\n    return b * a\n"
+    write(same.format("near") + same.format("far") + "def lost():\n    return None\n")
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
+    for command in (["init", "-q"], ["add", "."], ["commit", "-q", "-m", "one"]):
+        subprocess.run([*git, *command], check=True)
+    moved = same.format("_near").replace("    return", "    c = b\n    return")
+    write(moved + same.format("remote") + "class New:\n    size = 1\n    weight = 2\n")
+    rooms = code_size.kept_lines("HEAD", tmp_path)
+    assert rooms == {"groma": {"then": 6, "now": 7, "new": 3}, "gone": {"then": 2}}

@@ -100,6 +100,7 @@ def test_views_without_a_pose_are_left_out_and_folders_are_kept(true, tmp_path):
         (lambda d: d["intrinsics"][0].update(distortionType="3deradial4"), "'3deradial4' is not read"),
         (lambda d: d["intrinsics"][0].update(pixelRatio="2"), "not square"),
         (lambda d: d["intrinsics"][0].update(width="0"), "size in pixels"),
+        (lambda d: d["intrinsics"][0].update(width="640.5"), "'width', a size in pixels; got 640.5"),
         (lambda d: d["intrinsics"][0].update(sensorWidth="0"), "damaged or incomplete"),
         (lambda d: d["intrinsics"][0].pop("focalLength"), "'focalLength': expected finite numbers"),
         (lambda d: d["views"][0].pop("path"), "expected 'path', which is missing"),

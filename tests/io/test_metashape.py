@@ -131,6 +131,7 @@ def test_without_a_similarity_the_world_is_the_chunk(true, tmp_path):
         ("<k1>-0.1</k1>", "<k1>much</k1>", "k1"),
         ('type="frame"', 'type="cylindrical"', "type 'cylindrical' are not read"),
         (f'width="{WIDTH}"', 'width="0"', "size in pixels"),
+        (f'width="{WIDTH}"', 'width="640.5"', "'width', a size in pixels; got 640.5"),
         ("sensor_id", "sensor_ie", "expected a calibration, which is missing"),
         ("transform>", "transfer>", "no camera with a pose"),
         ("</chunk>", "", "is not XML"),

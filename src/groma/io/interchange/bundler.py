@@ -70,8 +70,6 @@ def read_bundler(path: str | os.PathLike[str]) -> Scene:
         cameras, rest = np.split(numbers, [_CAMERA * num_cameras])
         cameras = cameras.reshape(-1, _CAMERA)
         rows = point_rows(rest, num_points, place)
-        if rows.end != len(rest):
-            raise FileFormatError(f"{place} has {len(rest) - rows.end} numbers too many for its counts.")
         folder, names = _names(place, num_cameras)
         posed = np.flatnonzero(cameras[:, 0] != 0.0)
         used = cameras[posed]

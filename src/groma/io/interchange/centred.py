@@ -31,8 +31,6 @@ class PointRows:
     point_idx: IntArray
     image_idx: IntArray
     pixel: FloatArray
-    #: How many of the numbers were taken.
-    end: int
 
 
 def point_rows(numbers: FloatArray, count: int, path: Path) -> PointRows:
@@ -41,7 +39,7 @@ def point_rows(numbers: FloatArray, count: int, path: Path) -> PointRows:
     Raises
     ------
     FileFormatError
-        If the numbers end too early, or a count or an image is no whole number.
+        If the numbers end too early or late, or a count or an image is no whole number.
     """
     starts = np.zeros(count + 1, np.int64)
     at, size, listed = 0, len(numbers), numbers.tolist() if count else []
@@ -54,13 +52,15 @@ def point_rows(numbers: FloatArray, count: int, path: Path) -> PointRows:
             )
         at += 7 + 4 * int(views)
         starts[row + 1] = at
+    if at != size:
+        raise FileFormatError(f"{path} has {size - at} numbers too many for its counts.")
     head = starts[:-1, None] + np.arange(6)
     point_idx, within = numbered((np.diff(starts) - 7) // 4)
     views = numbers[(starts[point_idx] + 7 + 4 * within)[:, None] + np.arange(4)]
     if (views[:, 0] != np.floor(views[:, 0])).any() or (np.abs(views[:, 0]) > 2**31).any():
         raise FileFormatError(f"{path}: a view names an image by a number that is not whole. Correct the file.")
     points = numbers[head].reshape(-1, 6)
-    return PointRows(points[:, :3], points[:, 3:], point_idx, views[:, 0].astype(np.int64), views[:, 2:], at)
+    return PointRows(points[:, :3], points[:, 3:], point_idx, views[:, 0].astype(np.int64), views[:, 2:])
 
 
 def centred_scene(

@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.bounded.documents import member, names_early, of_kind, read_document, table
+from groma.bounded.documents import member, names_early, of_kind, read_document, size, table
 from groma.bounded.text import finite, shown
 from groma.errors import FileFormatError
 from groma.io.interchange.calibration import Calibration, camera_table, fisheye, polynomial
@@ -136,9 +136,8 @@ def _calibration(lens: dict[str, Any], version: tuple[int, ...], place: object) 
     kind = member(lens, "distortionType", str, where) if kind == "pinhole" and "distortionType" in lens else kind
     if kind not in _KINDS:
         raise FileFormatError(f"{where}: the camera {shown(kind)} is not read; known are {', '.join(_KINDS)}.")
-    width, height = (int(_numbers(lens, name, 1, where)[0]) for name in ("width", "height"))
-    if not (0 < min(width, height) and max(width, height) <= 10**6):
-        raise FileFormatError(f"{where}: expected a size in pixels; got {width} x {height}. Correct the file.")
+    sides = {name: _numbers(lens, name, 1, where)[0] for name in ("width", "height")}
+    width, height = size(sides, ("width", "height"), where)
     if "pxFocalLength" in lens:
         focal = _numbers(lens, "pxFocalLength", 1 if version < (1, 2, 0) else 2, where)
     else:

@@ -29,6 +29,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.bounded.content import read_content
+from groma.bounded.documents import size
 from groma.bounded.text import finite, shown
 from groma.errors import FileFormatError
 from groma.io.interchange.calibration import Calibration, camera_table, fisheye, panorama, polynomial
@@ -137,10 +138,9 @@ def _calibration(sensor: Element | None, key: str, place: object) -> Calibration
     found = found if adjusted is None else adjusted
     resolution = found.find("resolution")
     resolution = sensor.find("resolution") if resolution is None else resolution
-    words = ["0", "0"] if resolution is None else [resolution.get(name, "0") for name in ("width", "height")]
-    width, height = (int(value) for value in finite(words, where))
-    if not (0 < min(width, height) and max(width, height) <= 10**6):
-        raise FileFormatError(f"{where}: expected a size in pixels; got {width} x {height}. Correct the file.")
+    sides = {} if resolution is None else resolution.attrib
+    numbers = {name: finite([sides.get(name, "0")], where)[0] for name in ("width", "height")}
+    width, height = size(numbers, ("width", "height"), where)
     kind = found.get("type", sensor.get("type", ""))
     if kind == "spherical":
         return panorama((width, height))

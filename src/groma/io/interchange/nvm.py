@@ -104,8 +104,6 @@ def _model(lines: list[str], at: int, count: int, turn: int, path: Path) -> tupl
     if not np.isfinite(found).all():
         raise FileFormatError(f"{path} holds a number that is not finite. Correct the file.")
     rows = point_rows(found, num_points, path)
-    if rows.end != len(found):
-        raise FileFormatError(f"{path} has {len(found) - rows.end} numbers too many in its points.")
     return _Model(names, np.array(numbers).reshape(count, turn + 5), rows), at + num_points
 
 
