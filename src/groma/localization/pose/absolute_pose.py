@@ -306,8 +306,8 @@ def _unless_mirrored(
     """Return a verdict, or another one where the mirror image of a photograph fits about as well, and by matches that
     are more alike.
 
-    Some of its points are matched first: mostly far too few of them agree with any pose. That chance may explain its
-    pose is no excuse: lines, which it has none of, may be what places the photograph, and matches by chance are not alike.
+    Some of its points are matched first: mostly far too few of them agree with any pose. Chance may explain its
+    pose: it has no lines, which may be what places the photograph, and matches by chance are not the most alike.
     """
     agree = len(np.unique(cells_of(matches.points2d, here.own.camera, VERDICT.cells)[here.own.point_inliers]))
     wanted = votes_of_a_rival(agree)
