@@ -240,8 +240,9 @@ def _changed(tmp_path: Path, **changes: object) -> Path:
 )
 def test_archive_messages(tmp_path, changes, message):
     path = _changed(tmp_path, **changes)
-    with pytest.raises(FileFormatError, match=message):
+    with pytest.raises(FileFormatError, match=message) as refused:
         read_scene(path)
+    assert str(path) in str(refused.value)
 
 
 def test_distances_of_earlier_archives_are_read(tmp_path):

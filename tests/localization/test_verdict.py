@@ -9,7 +9,13 @@ from scipy.stats import binom, nbinom
 from worlds import CAMERA, make_world, pose_of
 
 from groma.geometry import quaternion
-from groma.localization.pose.absolute_pose import MapQuestions, PoseOptions, estimate_absolute_pose, pose_from_matches
+from groma.localization.pose.absolute_pose import (
+    MapQuestions,
+    MirrorQuestions,
+    PoseOptions,
+    estimate_absolute_pose,
+    pose_from_matches,
+)
 from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
@@ -208,6 +214,20 @@ def test_cells_that_are_off_like_their_neighbours_are_counted():
         assert low <= cells_elsewhere(found, matches, 34.0, np.zeros((0, 2))) <= high
         # Whatever shows the place is no piece of another.
         assert cells_elsewhere(found, matches, 34.0, pixels) == 0
+
+
+def test_a_mirror_image_that_chance_would_explain_is_asked_how_alike_it_is():
+    """A few points and lines place the photograph; of its mirror image four of thirty matches agree."""
+    world = make_world(np.random.default_rng(14), points=6, lines=12)
+    matches = Matches(world.points2d, world.points3d, world.segments2d, world.segments3d)
+    mirror = make_world(np.random.default_rng(17), points=30, lines=0)
+    mirror.points2d[4:] = np.random.default_rng(16).uniform((0, 0), (CAMERA.width, CAMERA.height), (26, 2))
+    mirrored = Matches(mirror.points2d, mirror.points3d)
+    assert pose_from_matches(CAMERA, mirrored).status == "failed"
+    for closest, status in (((2, 25), "uncertain"), ((25, 2), "localized")):
+        asked = MirrorQuestions(lambda step: mirrored, lambda *fits, closest=closest: closest)
+        judged = pose_from_matches(CAMERA, matches, of_map=MapQuestions(mirror=asked))
+        assert judged.status == status, judged.sentence
 
 
 def test_a_rival_needs_so_many_votes():

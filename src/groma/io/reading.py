@@ -22,8 +22,10 @@ def reading(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             yield
-    except FileFormatError:
-        raise
+    except FileFormatError as error:
+        if str(path) in str(error):
+            raise
+        raise FileFormatError(f"{path}: {error}") from error
     except GromaError as error:
         raise FileFormatError(f"{path} is not a usable {kind}: {error}") from error
     except IsADirectoryError as error:

@@ -306,7 +306,8 @@ def _unless_mirrored(
     """Return a verdict, or another one where the mirror image of a photograph fits about as well, and by matches that
     are more alike.
 
-    Some of its points are matched first: mostly far too few of them agree with any pose.
+    Some of its points are matched first: mostly far too few of them agree with any pose. Chance may explain its
+    pose: it has no lines, which may be what places the photograph, and matches by chance are not the most alike.
     """
     agree = len(np.unique(cells_of(matches.points2d, here.own.camera, VERDICT.cells)[here.own.point_inliers]))
     wanted = votes_of_a_rival(agree)
@@ -319,10 +320,7 @@ def _unless_mirrored(
             return verdict
     every = mirror.matches(1)
     other = _best_of_others(here.own.camera, every, options, wanted)
-    if other is None:
-        return verdict
-    evidence = evidence_of(other, every)
-    if not evidence.significant or evidence.agree < wanted:
+    if other is None or evidence_of(other, every).agree < wanted:
         return verdict
     return doubted_if_mirrored(verdict, *mirror.closest(here.best, here.used, other))
 
