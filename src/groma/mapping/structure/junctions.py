@@ -3,9 +3,9 @@ r"""Lines that meet: corners and branches of edges.
 
 Two lines meet where the distance between them, measured where they come nearest, is within the noise of both there, and
 where both are seen up to that place. As lines pass each other by chance, too, distances are a mixture of those of lines
-that meet and of evenly spread ones (:mod:`groma.estimators.membership`); a pair is kept if it is none by chance. How far
-ends deviate from where lines meet is estimated from the pairs of the scene in the same way: inner edges of a window end
-at a distance before the outer ones at which hardly any end of a corner is.
+that meet and of evenly spread ones (:mod:`groma.estimators.membership`); a pair is kept if it is none by chance. How
+far ends deviate from where lines meet is estimated in the same way: inner edges of a window end farther before the
+outer ones than the ends of edges before their corners.
 """
 
 from __future__ import annotations
