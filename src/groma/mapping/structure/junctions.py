@@ -29,6 +29,7 @@ class JunctionGates:
 
     reach_px: float = gate(8.0, "px", "from the end of a line to the place of meeting", STRUCTURE)
     end_px: float = gate(0.29, "px", "least deviation of the end of a line", "derived from a place within a pixel")
+    freedom: float = gate(4.0, "1", "degrees of freedom of Student's distribution of line ends", STRUCTURE)
     most_px: float = gate(1.0, "px", "that lines that meet may miss each other", "chosen on benchmarks/structure.py")
     min_sine: float = gate(0.17, "1", "of the angle of two lines that meet", "convention: ten degrees")
     nearest: int = gate(24, "samples", "of lines that an end of a line is compared with", SEARCH)
@@ -100,8 +101,16 @@ def _candidates(distance: FloatArray, variance: FloatArray, gap: FloatArray) -> 
         counted=np.ones(num, bool),
         group=np.zeros(num, np.int64),
     )
-    ends = memberships(candidates, np.array([GATES.reach_px])).deviation[0] * candidates.unit
-    return replace(candidates, variance=candidates.variance + ends**2, unit=np.tile([1.0, 0.0, 0.0], (num, 1)))
+    scale = memberships(candidates, np.array([GATES.reach_px])).deviation[0] * candidates.unit
+    square = candidates.variance + scale**2
+    # Errors of ends have heavy tails: offsets at which a normal density falls as Student's does.
+    tailed = np.sqrt((GATES.freedom + 1) * square * np.log1p(candidates.offset**2 / (GATES.freedom * square)))
+    return replace(
+        candidates,
+        offset=np.where(candidates.unit > 0.0, tailed, candidates.offset),
+        variance=square,
+        unit=np.tile([1.0, 0.0, 0.0], (num, 1)),
+    )
 
 
 def _neighbours(segments: FloatArray, pixel: FloatArray) -> IntArray:
