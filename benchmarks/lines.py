@@ -6,7 +6,8 @@
 A scene is one of the list, or KIND-SEED (boxes, room, wings, gable, stairs, tower): rendered anew, and compared at 0.2,
 1, 5 and 10 thousandths of its extent.
 
-Without a Python that has pylimap 2 groma runs alone. Scenes whose data is not in the folder are left out.
+Without a Python that has pylimap 2 groma runs alone; with one its rows are printed before LIMAP starts, and again with
+LIMAP's. Scenes whose data is not in the folder are left out.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import cv2
 import numpy as np
 from _line_curves import drawing
 from _line_scenes import LIMAP_MIN_LENGTH, MIN_LENGTH, NUM_NEIGHBORS, SCENES, UNSEEN, LineScene, unseen
-from _workshop import CACHE, CONTESTANTS, RESULTS, ROOT, machine, run_program
+from _workshop import CACHE, CONTESTANTS, RESULTS, ROOT, TIMEOUT, machine, run_program
 
 from groma import cameras as camera_models
 from groma.evaluation.lines import Distances, Geometry, places_on, score_lines
@@ -344,18 +345,24 @@ def main() -> int:
         except (OSError, ValueError) as error:
             print(f"{name} is left out: {error}")
             continue
-        rows = []
+        rows, missing = [], ""
         for matching in [arguments.matching] if arguments.matching else MATCHING:
             task = prepare(source, matching, arguments.cluster_size)
             found = run_groma(task)
-            found += run_limap(task, arguments.python_limap) if arguments.python_limap else []
             rows += [row_of(task, lines) for lines in found]
+            if arguments.python_limap:
+                print("\n" + table(source, rows), flush=True)  # LIMAP may take ten minutes
+                limap = run_limap(task, arguments.python_limap)
+                rows += [row_of(task, lines) for lines in limap]
+                found += limap
+                if not limap:
+                    missing += f"\nLIMAP ({matching}) gave no lines: it failed, or was stopped after {TIMEOUT} s.\n"
             for lines in found:
                 draw(task, lines, len(source.images) // 2, RESULTS / f"lines-{name}-{matching}-{lines.contestant}.png")
         result = {"scene": name, "thresholds": source.thresholds, "machine": machine(), "rows": rows}
         (RESULTS / f"lines-{name}.json").write_text(json.dumps(result, indent=1) + "\n")
         results.append(result)
-        texts.append(table(source, rows))
+        texts.append(table(source, rows) + missing)
         print("\n" + texts[-1], flush=True)
     if arguments.curves:
         arguments.curves.write_text(drawing([result for result in results if "curve" in result["rows"][1]]))

@@ -59,7 +59,9 @@ KINDS = (
     "point_on_plane",
     "lines_meeting",
     "parallel",
+    "parallel within half a degree",
     "right_angles",
+    "right angles within half a degree",
 )
 #: Lines along directions: columns of --exact, and the lines that an exactly given direction has at least.
 ALONG = ("line_along_direction", "within half a degree")
@@ -75,7 +77,8 @@ NEAR = 0.0025
 EXACT = 1e-6
 #: Edges that are turned by less against each other count as parallel, radians.
 PARALLEL = 0.003
-#: The same for the column that tells how many wrong directions are of edges turned by little, which lines cannot tell.
+#: The same for the columns that tell how many wrong directions and angles are of edges turned by little, less than what
+#: is held to be right may deviate.
 NEARLY = np.deg2rad(0.5)
 
 
@@ -258,7 +261,10 @@ def _angle_counts(vectors: np.ndarray, scene: Scene) -> dict[str, tuple[int, int
         pairs = pairs[(pairs < num).all(axis=1)]
         judged = pairs[np.isfinite(cosine[pairs[:, 0], pairs[:, 1]])]
         right = is_true[name][judged[:, 0], judged[:, 1]]
+        nearly = cosine > np.cos(NEARLY) if name == "parallel" else cosine < np.sin(NEARLY)
         result[name] = int(right.sum()), len(judged), int(np.triu(is_true[name], 1).sum())
+        turned = int(nearly[judged[:, 0], judged[:, 1]].sum())
+        result[f"{name} within half a degree".replace("_", " ")] = turned, len(judged), int(np.triu(nearly, 1).sum())
     return result
 
 

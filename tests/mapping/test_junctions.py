@@ -17,8 +17,11 @@ NOISE = 0.3
 
 
 @cache
-def boxes():
-    """Edges of boxes in random places, lines across them that meet nothing; true pairs; the scene seen with noise."""
+def boxes(windows=False):
+    """Edges of boxes in random places, lines across them that meet nothing; true pairs; the scene seen with noise.
+
+    Windows are squares inside a face, four to five pixels from its edges.
+    """
     rng = np.random.default_rng(3)
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
     pairs = [(a, b) for a in range(8) for b in range(a) if (corners[a] != corners[b]).sum() == 1]
@@ -26,7 +29,9 @@ def boxes():
     places = rng.uniform(-1.5, 1.5, (12, 1, 3)) + 0.25 * corners @ np.swapaxes(turns, 1, 2)
     edges = np.concatenate([place[np.array(pairs)] for place in places])
     loose = rng.uniform(-1.7, 1.7, (60, 1, 3)) + rng.normal(0.0, 0.3, (60, 2, 3))
-    ends = np.concatenate([edges, loose])
+    middle = places[:, :4].mean(axis=1, keepdims=True)
+    inner = (middle + 0.88 * (places[:, :4] - middle))[:, np.array([(0, 1), (1, 3), (3, 2), (2, 0)])]
+    ends = np.concatenate([edges, loose, inner.reshape(-1, 2, 3)[: None if windows else 0]])
     gap = np.linalg.norm(ends[:, None, :, None] - ends[None, :, None], axis=-1).min(axis=(2, 3))
     meeting = np.argwhere(np.triu(gap < 1e-9, 1))
     angles = np.linspace(0.0, 2.0 * np.pi, 10, endpoint=False)
@@ -52,6 +57,14 @@ def test_lines_that_meet_are_found_and_no_others():
     _, true, scene = boxes()
     found = find_structure(scene).relations.lines_meeting
     assert (found[:, 0] < found[:, 1]).all() and len(np.unique(found, axis=0)) == len(found)
+    right = (found[:, None] == true[None]).all(axis=2).any(axis=1)
+    assert right.sum() > 0.9 * len(true) and right.mean() > 0.98
+
+
+def test_inner_edges_of_windows_do_not_meet_the_outer_ones():
+    """Their lines cross in the face, but they end before: farther than the ends of other lines from their corners."""
+    _, true, scene = boxes(windows=True)
+    found = find_structure(scene).relations.lines_meeting
     right = (found[:, None] == true[None]).all(axis=2).any(axis=1)
     assert right.sum() > 0.9 * len(true) and right.mean() > 0.98
 

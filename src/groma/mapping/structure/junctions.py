@@ -3,12 +3,14 @@ r"""Lines that meet: corners and branches of edges.
 
 Two lines meet where the distance between them, measured where they come nearest, is within the noise of both there, and
 where both are seen up to that place. As lines pass each other by chance, too, distances are a mixture of those of lines
-that meet and of evenly spread ones (:mod:`groma.estimators.membership`); a pair is kept if it is none by chance.
+that meet and of evenly spread ones (:mod:`groma.estimators.membership`); a pair is kept if it is none by chance. How
+far ends deviate from where lines meet is estimated in the same way: inner edges of a window end farther before the
+outer ones than the ends of edges before their corners.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,7 +28,8 @@ class JunctionGates:
     """Which lines may meet."""
 
     reach_px: float = gate(8.0, "px", "from the end of a line to the place of meeting", STRUCTURE)
-    end_px: float = gate(2.5, "px", "deviation of the end of a line from where it meets another", STRUCTURE)
+    end_px: float = gate(0.29, "px", "least deviation of the end of a line", "derived from a place within a pixel")
+    freedom: float = gate(4.0, "1", "degrees of freedom of Student's distribution of line ends", STRUCTURE)
     most_px: float = gate(1.0, "px", "that lines that meet may miss each other", "chosen on benchmarks/structure.py")
     min_sine: float = gate(0.17, "1", "of the angle of two lines that meet", "convention: ten degrees")
     nearest: int = gate(24, "samples", "of lines that an end of a line is compared with", SEARCH)
@@ -83,20 +86,30 @@ def meetings(marks: Landmarks, level: float, least: float) -> Pairs:
 def _candidates(distance: FloatArray, variance: FloatArray, gap: FloatArray) -> Candidates:
     """Distances with their variances (N,) and gaps at the ends (N, 2), all in pixels, as one mixture.
 
-    The gap at the end of a line tells something where the line ends; where it goes on it is as likely either way.
+    The gap at the end of a line tells something where the line ends, with the deviation that the ends of the scene
+    have; where it goes on it is as likely either way.
     """
-    even = 0.5 / GATES.reach_px
+    even, num = 0.5 / GATES.reach_px, len(distance)
     ending = gap > -GATES.reach_px
     end_variance = np.where(ending, GATES.end_px**2, 0.5 / (np.pi * even**2))
-    num = len(distance)
-    return Candidates(
+    candidates = Candidates(
         owner=np.zeros(num, np.int64),
         offset=np.column_stack([distance, np.where(ending, gap, 0.0)]),
         variance=np.column_stack([variance, end_variance]),
-        unit=np.tile([1.0, 0.0, 0.0], (num, 1)),
+        unit=np.column_stack([np.zeros(num), ending]),
         clutter=np.full(num, 0.5 / GATES.reach_px * even**2),
         counted=np.ones(num, bool),
         group=np.zeros(num, np.int64),
+    )
+    scale = memberships(candidates, np.array([GATES.reach_px])).deviation[0] * candidates.unit
+    square = candidates.variance + scale**2
+    # Errors of ends have heavy tails: offsets at which a normal density falls as Student's does.
+    tailed = np.sqrt((GATES.freedom + 1) * square * np.log1p(candidates.offset**2 / (GATES.freedom * square)))
+    return replace(
+        candidates,
+        offset=np.where(candidates.unit > 0.0, tailed, candidates.offset),
+        variance=square,
+        unit=np.tile([1.0, 0.0, 0.0], (num, 1)),
     )
 
 
