@@ -22,8 +22,25 @@ def test_a_moved_measurement_is_its_residual():
     seen = scene.point_observations
     moved = drawable(scene.replace(point_observations=seen.replace(pixel=seen.pixel + np.array([3.0, -4.0]))))
     np.testing.assert_allclose(moved.residuals[:24], np.tile([-3.0, 4.0], (24, 1)), atol=1e-9)
-    np.testing.assert_allclose(moved.rms_by_image, np.sqrt(12 * 25 / (12 + 8)), atol=1e-6)
+    np.testing.assert_allclose(moved.median_by_image, 5.0, atol=1e-6)
     np.testing.assert_allclose(moved.point_errors, 5.0, atol=1e-9)
+
+
+def test_a_wrong_match_is_no_wrong_image():
+    scene = exact_scene()
+    seen = scene.point_observations
+    away = np.zeros(len(seen))
+    away[0] = 300.0
+    shown = drawable(scene.replace(point_observations=seen.replace(pixel=seen.pixel + away[:, None])))
+    np.testing.assert_allclose(shown.median_by_image, 0.0, atol=1e-6)
+    assert shown.lengths.max() > 300.0
+
+
+def test_an_image_without_observations_has_no_residual():
+    scene = exact_scene()
+    seen = scene.point_observations
+    shown = drawable(scene.replace(point_observations=seen.take(np.flatnonzero(seen.image_idx == 0))).points_only())
+    np.testing.assert_allclose(shown.median_by_image, 0.0, atol=1e-6)
 
 
 def test_line_residual_is_the_distance_in_the_image():
@@ -53,7 +70,7 @@ def test_points_behind_a_camera_are_not_counted():
     shown = drawable(scene.with_points(xyz))
     assert np.isnan(shown.residuals[[0, 12]]).all()
     assert np.isnan(shown.point_errors[0])
-    assert np.isfinite(shown.rms_by_image).all()
+    assert np.isfinite(shown.median_by_image).all()
 
 
 def test_squares_of_huge_residuals_do_not_overflow():

@@ -76,9 +76,17 @@ class Drawable:
         return np.linalg.norm(self.residuals, axis=1)
 
     @cached_property
-    def rms_by_image(self) -> FloatArray:
-        """(N,) root mean square residual of each image, pixels; zero where nothing was measured."""
-        return rms_by_group(self.lengths, self.residual_image, len(self.image_names))
+    def median_by_image(self) -> FloatArray:
+        """(N,) median residual of each image, pixels; zero where nothing was measured.
+
+        A wrong pose changes it; single wrong matches, which a robust loss leaves where they are, do not.
+        """
+        known = np.isfinite(self.lengths)
+        lengths, image = self.lengths[known], self.residual_image[known]
+        bounds = np.searchsorted(np.sort(image), np.arange(len(self.image_names) + 1))
+        ordered = np.append(lengths[np.lexsort([lengths, image])], 0.0)
+        twice = bounds[:-1] + bounds[1:]
+        return np.where(np.diff(bounds) > 0, 0.5 * (ordered[(twice - 1) // 2] + ordered[twice // 2]), 0.0)
 
 
 def drawable(scene: Scene) -> Drawable:

@@ -240,14 +240,15 @@ class _Search:
         log_alarms = _log_choose(total, size) + _log_choose(total - size, agree - size) if agree > size else 0.0
         if total == size and agree == size:
             return  # no match is left to be against it
+        if agree > size and log_alarms + (agree - size) * math.log(min(share, 1.0)) < 0.0:
+            return
         common = what_is_common(self.prepared.matches, self.kind)
-        if common and agree <= size:
+        if common:
             raise InputError(f"The matches do not determine a {self.kind} motion: {common}")
-        if agree <= size or log_alarms + (agree - size) * math.log(min(share, 1.0)) >= 0.0:
-            raise InputError(
-                f"No {self.kind} motion: {agree} of {total} matches agree with the best, which chance explains. Pass "
-                "matches of which more are right, or a larger sigma if theirs is."
-            )
+        raise InputError(
+            f"No {self.kind} motion: {agree} of {total} matches agree with the best, which chance explains. Pass "
+            "matches of which more are right, or a larger sigma if theirs is."
+        )
 
     def _check_alone(self, best: FloatArray, proposals: FloatArray) -> None:
         """Refuse where one of the proposals (h, 4, 4), the best first, leads to another motion that fits as well."""

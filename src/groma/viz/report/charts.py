@@ -158,7 +158,7 @@ def _log_ticks(low: float, high: float) -> list[float]:
 
 
 def bars(names: Sequence[str], before: FloatArray | None, after: FloatArray) -> str:
-    """Return one pair of bars per image: root mean square residual in pixels, the worst after adjustment first."""
+    """Return one pair of bars per image: median residual in pixels, the worst after adjustment first."""
     order = np.argsort(-after, kind="stable")[:MAX_BARS]
     row = 22
     height = row * len(order) + 8

@@ -104,7 +104,7 @@ def image_data(scene: Scene, kept: Kept, states: Sequence[Drawable], photographs
                 "points_seen": int(points_seen[image]),
                 "lines_seen": int(lines_seen[image]),
                 "frame": [left, top, width, height],
-                "rms": [float(state.rms_by_image[image]) for state in states],
+                "median": [float(state.median_by_image[image]) for state in states],
                 "photo": photos[place] if left == top == 0.0 else "",
             }
         )

@@ -127,9 +127,9 @@ def chart_cards(
         cards.append(("Convergence", caption, _charts.convergence(history, stages)))
     if len(after.residuals):
         limit = f" The {_charts.MAX_BARS} worst are shown." if len(after.image_names) > _charts.MAX_BARS else ""
-        earlier_images = before.rms_by_image if before is not None else None
-        chart = _charts.bars(after.image_names, earlier_images, after.rms_by_image)
-        cards.append(("Images", f"Root mean square residual, pixels, worst first.{limit} {key}", chart))
+        earlier_images = before.median_by_image if before is not None else None
+        chart = _charts.bars(after.image_names, earlier_images, after.median_by_image)
+        cards.append(("Images", f"Median residual, pixels, worst first.{limit} {key}", chart))
     lengths = _track_lengths(scene)
     if lengths:
         text = "".join(

@@ -48,7 +48,7 @@ function facts({ kind, index: i }) {
   if (kind === "direction") return [["Lines along it", links("line", linesAlong(i), 12)]];
   const entry = data.images[entryOfCamera[i]];
   return [
-    ["Residual", entry ? change(entry.rms[0], entry.rms[last]) + " rms" : ""], ["Lines seen", entry ? entry.lines_seen.toLocaleString("en") : "none"],
+    ["Residual", entry ? change(entry.median[0], entry.median[last]) + ", median" : ""], ["Lines seen", entry ? entry.lines_seen.toLocaleString("en") : "none"],
     ["Points seen", entry ? entry.points_seen.toLocaleString("en") : "none"], ["Standard deviation", pointSigma("centers", i)],
   ];
 }

@@ -82,7 +82,7 @@ function drawImage() {
     c.strokeStyle = colourOf("chosen"); c.lineWidth = 2 * ratio; c.beginPath(); c.arc(...at(rows[i * rowStep], rows[i * rowStep + 1]), 6 * ratio, 0, 7); c.stroke();
   }
   const parts = [[entry.lines_seen, "segment"], [entry.points_seen, "point"]].filter(p => p[0]).map(p => counted(...p));
-  $("image-title").textContent = [...parts, entry.rms[s].toPrecision(3) + " px rms"].join(", ") + (entry.photo || !anyPhoto ? "." : " (no photograph in the page).");
+  $("image-title").textContent = [...parts, entry.median[s].toPrecision(3) + " px median residual"].join(", ") + (entry.photo || !anyPhoto ? "." : " (no photograph in the page).");
 }
 function drawSegments(c, entry, at, state, width) {
   const order = Array.from({ length: entry.segments[1] - entry.segments[0] }, (_, i) => entry.segments[0] + i);
