@@ -5,7 +5,9 @@ import numpy as np
 
 from groma import cameras
 from groma.geometry import se3
+from groma.localization.stored import StoredImage
 from groma.scene import Cameras, LineObservations, Lines, Planes, PointObservations, Points, Relations, Scene
+from groma.viz.report.covariances import LandmarkCovariances
 
 PINHOLE = [500.0, 510.0, 320.0, 240.0]
 OPENCV = [400.0, 405.0, 310.0, 250.0, 0.05, -0.02, 0.001, -0.002]
@@ -45,3 +47,23 @@ def exact_scene(names=("first.jpg", "second.jpg"), seed=0) -> Scene:
             point_on_plane=np.stack([np.arange(5), np.zeros(5, int)], axis=1), line_on_plane=np.array([[0, 0]])
         ),
     )
+
+
+def localized_photograph() -> StoredImage:
+    """As `groma localize` puts it into a table."""
+    none, pose = np.zeros(0, int), se3.identity(1)[0]
+    return StoredImage(
+        "street/0001.jpg", "localized", "A sentence about it.", pose, 0.01 * np.eye(6), "PINHOLE", np.ones(4),
+        np.ones(2, int), none, np.zeros((0, 2)), none, np.zeros((0, 4)), 0.0,
+    )  # fmt: skip
+
+
+def random_covariances() -> LandmarkCovariances:
+    """Of the exact scene, different in every direction, so that a wrong axis shows."""
+    rng = np.random.default_rng(5)
+
+    def random(count: int, size: int) -> np.ndarray:
+        root = 0.01 * rng.normal(size=(count, size, size))
+        return root @ root.transpose(0, 2, 1)
+
+    return LandmarkCovariances("inner", random(12, 3), random(4, 6), random(1, 4), random(2, 3))

@@ -9,12 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from _scene import exact_scene
+from _scene import exact_scene, localized_photograph, random_covariances
 
-from groma.geometry import se3
 from groma.localization.result import card_of
-from groma.localization.stored import StoredImage
-from groma.viz.report.covariances import LandmarkCovariances
 from groma.viz.report.page import PageContents, write_report
 
 CHROMIUM = next((path for path in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if path), "")
@@ -58,14 +55,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def covariances(scene):
-    """Different in every direction, so that a wrong axis shows."""
-    rng = np.random.default_rng(5)
-
-    def random(count: int, size: int) -> np.ndarray:
-        root = 0.01 * rng.normal(size=(count, size, size))
-        return root @ root.transpose(0, 2, 1)
-
-    return LandmarkCovariances("inner", random(12, 3), random(4, 6), random(1, 4), random(2, 3))
+    return random_covariances()
 
 
 @pytest.fixture(scope="module")
@@ -75,12 +65,7 @@ def report(tmp_path_factory, scene, covariances):
     folder = tmp_path_factory.mktemp("report")
     for name in scene.images.names:
         cv2.imwrite(str(folder / name), np.full((480, 640, 3), 120, np.uint8))
-    none = np.zeros(0, int)
-    query = StoredImage(
-        "street/0001.jpg", "localized", "A sentence about it.", se3.identity(1)[0], 0.01 * np.eye(6), "PINHOLE",
-        np.ones(4), np.ones(2, int), none, np.zeros((0, 2)), none, np.zeros((0, 4)), 0.0,
-    )  # fmt: skip
-    contents = PageContents(cards=card_of([query]), covariances=covariances)
+    contents = PageContents(cards=card_of([localized_photograph()]), covariances=covariances)
     write_report(folder / "page.html", None, scene, images=folder, contents=contents)
     return (folder / "page.html").as_uri()
 
@@ -318,10 +303,8 @@ def test_a_phone(opened, scene):
     """Nothing wider than the screen, the scene without scrolling past numbers, taps that choose."""
     page = opened(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True, device_scale_factor=2)
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
-    localised = page.locator(".card.wide td")
-    assert localised.count() == 7 and all(
-        box["x"] + box["width"] <= 390 for box in (cell.bounding_box() for cell in localised.all())
-    )
+    cells = [cell.bounding_box() for cell in page.locator(".card.wide td").all()]
+    assert len(cells) == 7 and all(cell["x"] + cell["width"] <= 390 for cell in cells)
     box = page.locator("#scene").bounding_box()
     assert box["width"] > 300 and box["height"] >= 300 and box["y"] + box["height"] < 844
     _only(page, "lines")
