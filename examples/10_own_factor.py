@@ -9,8 +9,8 @@ from groma.geometry import Euclidean
 
 
 # The residual: predicted minus measured distance. Derivatives are taken by groma, and everything is compiled.
-@groma.factor("distance", slots=[("anchor", "point"), ("tag", "point")], residual_size=1, data_size=1)
-def Distance(data, anchor, tag, out):  # noqa: N802 (becomes a class)
+@groma.factor("range", slots=[("anchor", "point"), ("tag", "point")], residual_size=1, data_size=1)
+def Range(data, anchor, tag, out):  # noqa: N802 (becomes a class)
     """Distance between two points."""
     x, y, z = tag[0] - anchor[0], tag[1] - anchor[1], tag[2] - anchor[2]
     out[0] = (x * x + y * y + z * z) ** 0.5 - data[0]
@@ -30,7 +30,7 @@ problem = groma.Problem(
         "tags": groma.Variables(Euclidean(3, "point"), np.tile([5.0, 5.0, 2.0], (50, 1))),
     },
     factors=[
-        Distance(
+        Range(
             anchor=groma.Ref("anchors", anchor_idx),
             tag=groma.Ref("tags", tag_idx),
             data=measured[:, None],

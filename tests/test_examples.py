@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from groma.factors import contract
+
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
@@ -13,6 +15,7 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 @pytest.mark.parametrize("path", EXAMPLES, ids=[path.stem for path in EXAMPLES])
 def test_example_runs(path, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(contract, "_REGISTRY", dict(contract._REGISTRY))  # forget factors of its own
     for _ in range(2):
         runpy.run_path(str(path), run_name="__main__")
     assert capsys.readouterr().out

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 import pytest
 
-from groma.errors import InputError, ShapeError
+from groma.errors import InputError, ProblemError, ShapeError
 from groma.factors import contract as _factor
 from groma.factors._examples import charts
 from groma.factors.checks.check import ambients_of, check_factor, linearized, residuals_of
@@ -67,6 +67,22 @@ def test_a_pinhole_camera_in_a_few_lines(options, tolerance):
     assert registered()["my_pinhole"] is Pinhole
     check = check_factor(Pinhole, np.random.default_rng(2), tolerance=tolerance)
     assert set(check.worst) == {"pose", "point"}
+
+
+def test_a_name_belongs_to_one_factor():
+    """Made again, as a cell of a notebook, it takes its own place, but not that of another with its name."""
+
+    def Distance(data, x, out):  # noqa: N802
+        out[0] = x[0] - data[0]
+
+    for _ in range(2):
+        made = factor("along_x", slots=[("x", "point")], residual_size=1, data_size=1)(Distance)
+    assert registered()["along_x"] is made
+    with pytest.raises(ProblemError, match=r"'distance' is registered already \(groma\..*Distance\)"):
+        factor("distance", slots=[("x", "point")], residual_size=1, data_size=1)(Distance)
+    Distance.__qualname__ = "Distance"
+    with pytest.raises(ProblemError, match="Choose another name"):
+        factor("distance", slots=[("x", "point")], residual_size=1, data_size=1)(Distance)
 
 
 def test_agrees_with_the_same_factor_written_by_hand():

@@ -217,11 +217,21 @@ _F = TypeVar("_F", bound=type[Factor])
 
 
 def register(name: str) -> Callable[[_F], _F]:
-    """Register a factor type under ``name``; the conformance tests and the docs' table then include it."""
+    """Register a factor type under ``name``; the conformance tests and the docs' table then include it.
+
+    Raises
+    ------
+    ProblemError
+        If the name belongs to another class; the same one may be made again, as in a notebook.
+    """
 
     def decorate(cls: _F) -> _F:
-        if name in _REGISTRY and _REGISTRY[name].__qualname__ != cls.__qualname__:
-            raise ProblemError(f"A factor named {name!r} is registered already ({_REGISTRY[name].__qualname__}).")
+        known = _REGISTRY.get(name, cls)
+        if (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
+            raise ProblemError(
+                f"A factor named {name!r} is registered already ({known.__module__}.{known.__qualname__}). Choose "
+                "another name."
+            )
         cls.type_name = name
         _REGISTRY[name] = cls
         return cls
