@@ -96,7 +96,7 @@ def _candidates(distance: FloatArray, variance: FloatArray, gap: FloatArray) -> 
         owner=np.zeros(num, np.int64),
         offset=np.column_stack([distance, np.where(ending, gap, 0.0)]),
         variance=np.column_stack([variance, end_variance]),
-        unit=np.column_stack([np.zeros(num), ending]),
+        unit=np.column_stack([np.zeros(num), ending.astype(np.float64)]),
         clutter=np.full(num, 0.5 / GATES.reach_px * even**2),
         counted=np.ones(num, bool),
         group=np.zeros(num, np.int64),
