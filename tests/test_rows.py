@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from groma._rows import Rows, distinct, pointers_of
+from groma._rows import Rows, distinct, medians, pointers_of
 from groma.tracking.frame.measurements import LineMeasurements, PlaneMeasurements, PointMeasurements
 from groma.tracking.map.lines import FollowedSegments
 
@@ -52,3 +52,11 @@ def test_pointers_of_groups_are_whole_numbers_also_without_groups():
     np.testing.assert_array_equal(pointers_of([2, 0, 3]), [0, 2, 2, 5])
     np.testing.assert_array_equal(pointers_of(np.array([True, False])), [0, 1, 1])
     assert pointers_of([]).tolist() == [0] and pointers_of([]).dtype == np.int64
+
+
+def test_medians_of_groups():
+    """Of odd and even numbers of values in any order; a group of none, first, within and last."""
+    values, group = np.array([5.0, 1.0, 8.0, 2.0, 4.0, 3.0]), np.array([3, 1, 3, 1, 1, 3])
+    np.testing.assert_array_equal(medians(values, group, 5), [0.0, 2.0, 0.0, 5.0, 0.0])
+    np.testing.assert_array_equal(medians(values[:2], group[1:3] * 0, 1), [3.0])
+    assert medians(np.zeros(0), np.zeros(0, int), 0).shape == (0,)

@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from groma._typing import BoolArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 
 
 def numbered(count: IntArray) -> tuple[IntArray, IntArray]:
@@ -31,6 +31,14 @@ def distinct(numbers: IntArray, count: int) -> tuple[IntArray, IntArray]:
     among = np.zeros(count, bool)
     among[numbers] = True
     return np.flatnonzero(among), (np.cumsum(among) - 1)[numbers]
+
+
+def medians(values: FloatArray, group: IntArray, count: int) -> FloatArray:
+    """Return the median (count,) of the values of each group; zero of groups that have none."""
+    bounds = pointers_of(np.bincount(group, minlength=count))
+    ordered = np.append(values[np.lexsort([values, group])], 0.0)
+    twice = bounds[:-1] + bounds[1:]
+    return np.where(np.diff(bounds) > 0, 0.5 * (ordered[(twice - 1) // 2] + ordered[twice // 2]), 0.0)
 
 
 def connected_parts(first: IntArray, second: IntArray, count: int) -> IntArray:

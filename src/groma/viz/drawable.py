@@ -16,6 +16,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from groma._rows import medians
 from groma._typing import FloatArray, IntArray
 from groma.cameras import CameraModel
 from groma.geometry import se3
@@ -82,11 +83,7 @@ class Drawable:
         A wrong pose changes it; single wrong matches, which a robust loss leaves where they are, do not.
         """
         known = np.isfinite(self.lengths)
-        lengths, image = self.lengths[known], self.residual_image[known]
-        bounds = np.searchsorted(np.sort(image), np.arange(len(self.image_names) + 1))
-        ordered = np.append(lengths[np.lexsort([lengths, image])], 0.0)
-        twice = bounds[:-1] + bounds[1:]
-        return np.where(np.diff(bounds) > 0, 0.5 * (ordered[(twice - 1) // 2] + ordered[twice // 2]), 0.0)
+        return medians(self.lengths[known], self.residual_image[known], len(self.image_names))
 
 
 def drawable(scene: Scene) -> Drawable:

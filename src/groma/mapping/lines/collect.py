@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from groma._rows import medians
 from groma._typing import FloatArray, IntArray
 from groma.mapping.lines.hypotheses.positions import SegmentPositions
 from groma.mapping.lines.line_map import LineMap
@@ -54,7 +55,7 @@ def line_map_of(
         line_idx=line_idx,
         residual=residual,
         num_images=tracks.num_images(),
-        median_residual=_medians(residual, line_idx, tracks.num_lines),
+        median_residual=medians(residual, line_idx, tracks.num_lines),
         uncertainty=tracks.uncertainty,
         outcomes=tuple(outcomes[first:last] for first, last in pairwise(pointers)),
         neighbors=tuple(neighbors),
@@ -62,12 +63,3 @@ def line_map_of(
         rejection=positions.rejection,
         depth_ratios=ratios,
     )
-
-
-def _medians(values: FloatArray, owner: IntArray, count: int) -> FloatArray:
-    """Median (count,) of the values of each owner; values come by owner, and each has some."""
-    if count == 0:
-        return np.zeros(0)
-    bounds = np.searchsorted(owner, np.arange(count + 1))
-    ordered = values[np.lexsort([values, owner])]
-    return 0.5 * (ordered[(bounds[:-1] + bounds[1:] - 1) // 2] + ordered[(bounds[:-1] + bounds[1:]) // 2])
