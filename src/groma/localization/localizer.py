@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from groma._log import log_warnings, logged_stages
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.errors import InputError
+from groma.errors import InputError, check_kind, given_or_default
 from groma.features.images import GrayImage, to_gray
 from groma.gates import gate
 from groma.io import read_scene
@@ -46,7 +46,7 @@ from groma.localization.pose.absolute_pose import (
     PoseOptions,
     pose_from_matches,
 )
-from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.camera import CAMERA_WAY, QueryCamera
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.refinement import Refined
@@ -132,7 +132,7 @@ class Localizer:
         progress: Callable[[str, int, int], None] | None = None,
     ) -> None:
         say = logged_stages("localization", progress)
-        self.options = options or LocalizeOptions()
+        self.options = given_or_default(options, LocalizeOptions)
         self.scene = map_ if isinstance(map_, Scene) else read_scene(map_)
         check_map(self.scene)
         if index is None and not isinstance(map_, Scene):
@@ -195,6 +195,7 @@ class Localizer:
         if camera is None:
             camera = unknown_camera(width, height)
             options = replace(options, refine_lens=True, focal_factors=UNKNOWN_LENS)
+        check_kind(camera, QueryCamera, "camera", CAMERA_WAY)
         if (camera.width, camera.height) != (width, height):
             raise InputError(
                 f"The image has {width}x{height} pixels, its camera {camera.width}x{camera.height}. Pass the "

@@ -23,7 +23,7 @@ from groma._counted import counted
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.graphs.linear_start import linear_start
 from groma.adjustment.report import Progress, not_converged
-from groma.errors import InputError, check_kind
+from groma.errors import InputError, check_kind, given_or_default
 from groma.factors.contract import Ref
 from groma.factors.losses import Loss, Trivial
 from groma.factors.losses import loss as make_loss
@@ -136,7 +136,7 @@ def adjust_pose_graph(
         If the graph has no motions.
     """
     check_kind(graph, PoseGraph, "graph", "Read one with groma.io.read_g2o(path).")
-    options = options or PoseGraphOptions()
+    options = given_or_default(options, PoseGraphOptions)
     if not len(graph.motions):
         poses = counted(len(graph.poses), "poses")
         raise InputError(f"The graph has {poses} and no motions between them; nothing to adjust.")
@@ -170,7 +170,7 @@ def adjust_pose_graph(
 
 def pose_graph_problem(graph: PoseGraph, options: PoseGraphOptions | None = None) -> Problem:
     """Return the problem of a graph: ``poses`` (body_from_world), motions without, and motions with a loss."""
-    options = options or PoseGraphOptions()
+    options = given_or_default(options, PoseGraphOptions)
     part, held = graph.parts(), graph.poses.held
     has_held = np.zeros(part.max(initial=-1) + 1, dtype=bool)
     has_held[part[held]] = True
