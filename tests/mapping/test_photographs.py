@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from groma.errors import InputError
+from groma.localization.map_images import image_paths
 from groma.mapping.photographs import (
     check_names,
     copies_among,
@@ -56,6 +57,20 @@ def test_folders_are_looked_into_unless_they_are_hidden(tmp_path):
         "b/1.jpg",
         "b/c/2.JPG",
     ]
+
+
+def test_links_to_folders_are_followed_once(tmp_path):
+    """A link to what is there anyway adds nothing, nor does one to the folder itself, or above it."""
+    for name in ("photos/a/1.png", "elsewhere/2.png", "elsewhere/deep/3.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    photos = tmp_path / "photos"
+    for link, target in (("rgb", "elsewhere"), ("0", "photos/a"), ("again", "photos"), ("up", ".")):
+        (photos / link).symlink_to(tmp_path / target)
+    (tmp_path / "elsewhere/back").symlink_to(photos)
+    found = [path.relative_to(photos).as_posix() for path in image_files(photos)]
+    assert found == ["a/1.png", "rgb/2.png", "rgb/deep/3.png"]
+    assert image_paths(["2.png"], photos) == [photos / "rgb/2.png"]
 
 
 def test_copies_are_no_further_photographs(tmp_path):

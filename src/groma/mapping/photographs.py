@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 import posixpath
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -24,7 +23,7 @@ import numpy as np
 from groma._counted import counted, first_of
 from groma._typing import FloatArray
 from groma.bounded.images import decoded
-from groma.bounded.names import IMAGES, UNREAD, VIDEOS, is_text
+from groma.bounded.names import IMAGES, UNREAD, VIDEOS, files_below, is_text
 from groma.bounded.text import shown
 from groma.cameras import model as camera_model
 from groma.errors import FileFormatError, GromaError, InputError
@@ -82,12 +81,7 @@ def image_files(folder: Path) -> list[Path]:
 
 
 def _with_endings(folder: Path, endings: tuple[str, ...]) -> list[Path]:
-    files: list[Path] = []
-    for place, folders, names in os.walk(folder):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        pictures = [name for name in names if not name.startswith(".") and name.lower().endswith(endings)]
-        files += [path for name in pictures if (path := Path(place, name)).is_file()]
-    return sorted(files)
+    return [path for path in files_below(folder) if path.name.lower().endswith(endings)]
 
 
 def _of_unread_kind(files: Sequence[Path], folder: Path) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 
 from groma._typing import BoolArray
 from groma.bounded.images import decoded
-from groma.bounded.names import IMAGES
+from groma.bounded.names import IMAGES, files_below
 from groma.errors import FileFormatError, InputError
 from groma.io.depth_maps import at_size, has_proportions
 from groma.io.reading import reading
@@ -48,8 +48,8 @@ class Masks:
             raise InputError(f"{folder} is not a folder of masks ({', '.join(IMAGES)}). Check the path.")
         known = {
             path.relative_to(folder).with_suffix("").as_posix(): path
-            for path in sorted(folder.rglob("*"))
-            if path.suffix.lower() in IMAGES and path.is_file()
+            for path in files_below(folder)
+            if path.suffix.lower() in IMAGES
         }
         places = [PurePosixPath(name) for name in names]
         if not any("/" in key for key in known) and len({place.stem for place in places}) == len(places):

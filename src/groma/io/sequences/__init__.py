@@ -8,9 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from groma._counted import first_of
-from groma.bounded.names import VIDEOS
+from groma.bounded.names import VIDEOS, existing
 from groma.errors import InputError
-from groma.io.reading import existing
 from groma.io.sequences._calibration import Calibration, CameraLike, calibration_of
 from groma.io.sequences._reader import Selection
 from groma.io.sequences.euroc import euroc_root, open_euroc
