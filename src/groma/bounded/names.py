@@ -78,6 +78,13 @@ def files_below(folder: Path) -> list[Path]:
     return sorted(files)
 
 
+def masks_among(names: Iterable[str]) -> set[str]:
+    """Return those of some names of images that are masks of others: ``a_mask.png`` or ``a.jpg.png`` of ``a.jpg``."""
+    stems = {name: os.path.splitext(name)[0] for name in names}
+    plain = set(stems.values())
+    return {n for n, s in stems.items() if s in stems or (s.endswith("_mask") and s.removesuffix("_mask") in plain)}
+
+
 def outside(names: Iterable[str]) -> list[str]:
     """Return the names that leave their folder."""
     return [name for name in names if not stays_inside(name)]

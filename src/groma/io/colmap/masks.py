@@ -19,7 +19,7 @@ import numpy as np
 
 from groma._typing import BoolArray
 from groma.bounded.images import decoded
-from groma.bounded.names import IMAGES, files_below
+from groma.bounded.names import IMAGES, files_below, masks_among
 from groma.errors import FileFormatError, InputError
 from groma.io.depth_maps import at_size, has_proportions
 from groma.io.reading import reading
@@ -46,11 +46,10 @@ class Masks:
         """
         if not folder.is_dir():
             raise InputError(f"{folder} is not a folder of masks ({', '.join(IMAGES)}). Check the path.")
-        known = {
-            path.relative_to(folder).with_suffix("").as_posix(): path
-            for path in files_below(folder)
-            if path.suffix.lower() in IMAGES
-        }
+        found = {path.relative_to(folder).as_posix(): path for path in files_below(folder)}
+        found = {name: path for name, path in found.items() if path.suffix.lower() in IMAGES}
+        beside = masks_among(found)  # then the others are photographs
+        known = {PurePosixPath(name).with_suffix("").as_posix(): found[name] for name in (beside or found)}
         places = [PurePosixPath(name) for name in names]
         if not any("/" in key for key in known) and len({place.stem for place in places}) == len(places):
             places = [PurePosixPath(place.name) for place in places]
