@@ -55,7 +55,7 @@ def localize(
     ] = None,
     masks: Annotated[
         Path | None,
-        _options.PLAIN.option("Masks of the queries, as for groma map --masks: black is not used.", metavar="FOLDER"),
+        _options.PLAIN.option("Masks of the queries, as for groma map --masks: black is not used.", metavar="PATH"),
     ] = None,
     lines: Annotated[bool, _options.PLAIN.option("Use lines in addition to points.")] = True,
     min_length: Annotated[
