@@ -5,6 +5,7 @@ import os
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
 from docutils import nodes
 from sphinx import addnodes
@@ -84,6 +85,7 @@ _ARRAY = re.compile(
 _DEFERRED = re.compile(r"~?(?:[\w.]+\.)?TypeAliasForwardRef\('(\w+)'\)")
 _LIKE = re.compile(r"~?[\w.]*_Buffer \| .*?_NestedSequence\[complex \| bytes \| str\]")
 _SHORT = {"float64": "FloatArray", "integer": "IntArray", "bool": "BoolArray", "bool_": "BoolArray"}
+_BACK = re.compile(r'<a class="viewcode-back" href="((?:\.\./)*)([\w/-]+)\.html#([\w.]+)">')
 _PIPES = re.compile(r"(`[^`]*`)|(?<!\\)\|([^|\s][^|]*?)\|")
 
 
@@ -130,8 +132,23 @@ def _parse_attribute_as_text(self: NumpyDocstring) -> list[str]:
     return NumpyDocstring(list(self._lines), self._config, self._app, "method", self._name, self._obj).lines()
 
 
+def _link_back(app: Sphinx, page: str, template: str, context: dict[str, Any], doctree: nodes.document | None) -> None:
+    """Let a source link to the name that it is documented under: viewcode takes one module for all names of a file."""
+    entries = app.env.domains.python_domain.objects
+
+    def right(match: re.Match[str]) -> str:
+        document, name = match[2], match[3]
+        last = f".{name.rpartition('.')[2]}"
+        alike = (entry for key, entry in entries.items() if key.endswith(last) and entry.docname == document)
+        found = entries.get(name) or next(alike, None)
+        return f'<a class="viewcode-back" href="{match[1]}{found.docname}.html#{found.node_id}">' if found else "<a>"
+
+    if page.startswith("_modules/"):
+        context["body"] = _BACK.sub(right, context["body"])
+
+
 def setup(app: Sphinx) -> None:
-    """Register the four above, and links to pages of the sources."""
+    """Register the five above, and links to pages of the sources."""
     app.connect("autodoc-process-signature", _shorten_signature)
     app.connect("doctree-read", _shorten_attributes)
     NumpyDocstring._parse_attribute_docstring = _parse_attribute_as_text
@@ -139,3 +156,4 @@ def setup(app: Sphinx) -> None:
     # Pages of the sources, six of seven of all pages, are left out where pages are only checked: sphinx-build -t check.
     if not app.tags.has("check"):
         app.setup_extension("sphinx.ext.viewcode")
+        app.connect("html-page-context", _link_back)

@@ -10,14 +10,20 @@ import pytest
 
 import groma
 from groma import io
+from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.errors import InputError
 from groma.geometry import line3, plane3, quaternion, se3, sim3
+from groma.mapping.lines.build import map_lines
+from groma.mapping.structure.find import find_structure
 from groma.scene.synthetic import corridor, holistic
 
 SCENE = holistic(2, seed=0).start
+CAMERA = groma.QueryCamera("SIMPLE_PINHOLE", np.array([500.0, 320.0, 240.0]), 640, 480)
+PIXELS, PLACES = np.zeros((4, 2)), np.ones((4, 3))
 TAKE_SCENES = {
     "adjust": groma.adjust,
     "adjust_surveyed": groma.adjust_surveyed,
+    "assemble": lambda scene: assemble(scene, AssemblyOptions()),
     "align": lambda scene: groma.align(scene, SCENE),
     "align to": lambda scene: groma.align(SCENE, scene),
     "contributions": groma.contributions,
@@ -26,6 +32,9 @@ TAKE_SCENES = {
     "evaluate_lines with": lambda scene: groma.evaluate_lines(SCENE, scene),
     "evaluate_planes": lambda scene: groma.evaluate_planes(scene, SCENE),
     "evaluate_poses": lambda scene: groma.evaluate_poses(SCENE, scene),
+    "find_structure": find_structure,
+    "map_images": lambda scene: groma.map_images("photographs", "work", scene),
+    "map_lines": lambda scene: map_lines(scene, []),
     "reliability": groma.reliability,
     "uncertainty": groma.uncertainty,
     "write_parts": lambda scene: groma.write_parts(scene, "parts"),
@@ -58,6 +67,17 @@ def test_a_path_or_a_result_is_no_scene(function, tmp_path, monkeypatch):
         (lambda: groma.adjust_pose_graph("a.g2o"), r"graph must be a PoseGraph; got str.*read_g2o"),  # type: ignore[arg-type]
         (lambda: groma.evaluate_trajectory("a.txt", "b.txt"), "estimate must be a Trajectory; got str"),  # type: ignore[arg-type]
         (lambda: groma.estimate_motion(np.zeros((4, 6))), "matches must be a LandmarkMatches; got ndarray"),  # type: ignore[arg-type]
+        (lambda: groma.estimate_absolute_pose("abc"), r"camera must be a QueryCamera; got str\. Make one"),  # type: ignore[arg-type]
+        (lambda: groma.Localizer(SCENE, options={}), "options must be a LocalizeOptions; got dict"),  # type: ignore[arg-type]
+        (lambda: groma.Tracker(CAMERA), "camera must be a SequenceCamera; got QueryCamera"),  # type: ignore[arg-type]
+        (lambda: groma.track(3), "sequence must be a Sequence; got int"),  # type: ignore[arg-type]
+        (lambda: groma.loss(None), "name must be a str; got NoneType"),  # type: ignore[arg-type]
+        (lambda: groma.Problem([], []), "variables must be a Mapping; got list"),  # type: ignore[arg-type]
+        (lambda: groma.Variables(None, PLACES), "manifold must be a Manifold; got NoneType"),  # type: ignore[arg-type]
+        (lambda: groma.adjust(SCENE, {"loss": "huber"}), "options must be an AdjustOptions; got dict.*leave it out"),  # type: ignore[arg-type]
+        (lambda: groma.adjust_surveyed(SCENE, options={}), "options must be an AdjustOptions; got dict"),  # type: ignore[arg-type]
+        (lambda: groma.uncertainty(SCENE, groma.AdjustOptions()), "must be an AssemblyOptions; got AdjustOptions"),  # type: ignore[arg-type]
+        (lambda: groma.diagnose(SCENE, groma.AdjustOptions()), "must be an AssemblyOptions; got AdjustOptions"),  # type: ignore[arg-type]
         (lambda: groma.cameras.model(1), "name must be a str; got int"),  # type: ignore[arg-type]
         (lambda: holistic(4, noise_px=float("nan")), "noise_px must be a standard deviation, 0 or more; got nan"),
         (lambda: holistic(4, structure=-1.0), "structure must be a standard deviation, 0 or more; got -1"),
@@ -67,6 +87,32 @@ def test_a_path_or_a_result_is_no_scene(function, tmp_path, monkeypatch):
 def test_other_kinds_are_named(function, words):
     with pytest.raises(InputError, match=words):
         function()
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"points2d": "abc"}, "points2d must be an array of real numbers; got str"),
+        ({"points3d": None}, r"points3d must have shape \(4, 3\), one row a match; got \(0, 3\)"),
+        ({"points3d": PLACES * np.nan}, "points3d must be finite"),
+        ({"sigma": 2.0}, r"\[sigma\] must have shape \(N, 2\)"),
+        ({"sigma": (0.0, 1.0)}, "point_sigma must be positive"),
+        ({"covariances": None}, r"covariances must be a tuple or list; got NoneType\. Pass \(of points, of lines\)"),
+        ({"covariances": ("abc", None)}, "covariances must be an array of real numbers"),
+        ({"covariances": (np.eye(3), None)}, r"point_covariance must have shape \(4, 3, 3\)"),
+        ({"covariances": (np.tile(-np.eye(3), (4, 1, 1)), None)}, "of points must be symmetric positive semidefinite"),
+        ({"covariances": (np.tile(np.tri(3), (4, 1, 1)), None)}, "of points must be symmetric positive semidefinite"),
+    ],
+)
+def test_matches_of_a_pose_that_are_none(given, words):
+    with pytest.raises(InputError, match=words):
+        groma.estimate_absolute_pose(CAMERA, **({"points2d": PIXELS, "points3d": PLACES} | given))
+
+
+def test_covariances_may_be_singular():
+    """What is exact along one axis has a covariance without inverse, and rounding may leave it slightly negative."""
+    flat = np.tile(np.diag([1e-4, 1e-4, -1e-24]), (4, 1, 1))
+    assert groma.estimate_absolute_pose(CAMERA, PIXELS, PLACES, covariances=(flat, None)).status == "failed"
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,9 @@ an error: see :class:`groma.solver.termination.Termination`.
 
 import difflib
 from collections.abc import Iterable, Iterator
+from typing import TypeVar
+
+_Options = TypeVar("_Options")
 
 
 class GromaError(Exception):
@@ -58,7 +61,16 @@ def check_kind(value: object, kinds: type | tuple[type, ...], name: str, way: st
     """Raise InputError unless the argument ``name`` is of a kind; ``way`` is a sentence that says how to get one."""
     if not isinstance(value, kinds):
         wanted = " or ".join(kind.__name__ for kind in (kinds if isinstance(kinds, tuple) else (kinds,)))
-        raise InputError(f"{name} must be a {wanted}; got {type(value).__name__}. {way}")
+        article = "an" if wanted[0] in "AEIOU" else "a"
+        raise InputError(f"{name} must be {article} {wanted}; got {type(value).__name__}. {way}")
+
+
+def given_or_default(value: _Options | None, kind: type[_Options], name: str = "options") -> _Options:
+    """Return options, by default those of their kind; raise InputError where they are of another one."""
+    if value is None:
+        return kind()
+    check_kind(value, kind, name, f"Make one: {kind.__name__}(...), or leave it out.")
+    return value
 
 
 def require(condition: object, what: str, message: str) -> None:

@@ -127,9 +127,16 @@ def test_poses_of_the_plane_stay_there(rng):
 def test_the_cost_of_noise_is_its_redundancy(rng):
     """Twice the cost has the chi-square distribution of 6 (motions - poses + 1) degrees of freedom."""
     _, graph = ring(rng, count=40, noise=0.01)
-    report = adjust_pose_graph(graph).report
+    result = adjust_pose_graph(graph)
     redundancy = 6 * (80 - 39)
-    assert abs(2 * report.final_cost - redundancy) < 4 * np.sqrt(2 * redundancy)
+    assert abs(2 * result.report.final_cost - redundancy) < 4 * np.sqrt(2 * redundancy)
+    assert result.noise == pytest.approx(np.sqrt(2 * result.report.final_cost / redundancy)) and not result.warnings
+
+
+def test_a_graph_whose_motions_are_all_needed_has_no_noise(rng):
+    _, graph = ring(rng, count=10)
+    result = adjust_pose_graph(graph.replace(motions=graph.motions.take(np.flatnonzero(graph.odometry()))))
+    assert np.isnan(result.noise) and result.summary()["noise"] is None and not result.warnings
 
 
 def test_held_poses_and_the_first_of_each_part_stay(rng):
@@ -191,6 +198,9 @@ def test_a_wrong_motion_loses(rng):
         result = adjust_pose_graph(wrong, PoseGraphOptions(loss=loss))
         moved[loss] = np.abs(result.graph.poses.world_from_body - without)[:, 4:].max()
         assert result.outliers.tolist() == ([] if loss == "none" else [60])
+        # least squares spreads the error, and it is said; with a loss the others agree as they should
+        assert ["contradict the others" in one for one in result.warnings] == [True] * (loss == "none")
+        assert result.noise > 5.0 if loss == "none" else result.noise < 1.2
     # robust losses weigh right motions a little, too: the poses would differ by this even without the wrong one
     assert moved["none"] > 0.5 and max(moved["cauchy"], moved["geman_mcclure"]) < 0.05
 

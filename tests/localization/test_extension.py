@@ -25,11 +25,13 @@ from groma.localization.extension import _with_new_lenses, extended_model, in_wo
 from groma.localization.joining.merging import _line_sigma, _one_to_one, _same_lines, merged_model
 from groma.localization.localizer import Localizer
 from groma.localization.pose.camera import QueryCamera
-from groma.localization.posed_model import gather_photographs
+from groma.localization.posed_model import _own_points, gather_photographs
+from groma.mapping.noise.landmarks import pixels_of
 from groma.mapping.result import MapResult
 from groma.scene import CameraPositions, Cameras, Distances, LineObservations, Scene, Similarity
 from groma.scene.landmarks import Lines
 from groma.scene.survey import Kind
+from groma.scene.synthetic import holistic
 
 FRAMES = [f"{number:04d}.jpg" for number in range(24, 32)]
 HALVES = {"a": FRAMES[0::2], "b": FRAMES[1::2]}
@@ -39,6 +41,22 @@ MOVED = Similarity(2.5, so3.exp(np.array([0.3, -0.5, 1.0])), np.array([1.0, 2.0,
 
 def quiet(stage, done, total):
     pass
+
+
+def test_features_at_the_place_of_a_point_are_of_it_only_where_all_of_the_track_are():
+    """Behind a point of the map, on its ray in the first image, lies another: the other images see it elsewhere."""
+    scene = holistic(4, noise_px=0.0, seed=0).truth
+    seen = scene.point_observations
+    times = np.bincount(seen.point_idx, minlength=scene.num_points)
+    point = int(times.argmax())
+    rows = np.flatnonzero(seen.point_idx == point)
+    center = scene.cam_centers_in_world[seen.image_idx[rows[0]]]
+    behind = center + 1.5 * (scene.points.xyz[point] - center)
+    image = np.concatenate([seen.image_idx[rows]] * 2)
+    pixels = np.concatenate([seen.pixel[rows], pixels_of(scene, image[: len(rows)], np.tile(behind, (len(rows), 1)))])
+    track = np.repeat([0, 1], len(rows))
+    np.testing.assert_allclose(pixels[len(rows)], pixels[0], atol=1e-6)
+    assert _own_points(scene, image, pixels, np.full(len(image), 2.0), track, 2).tolist() == [point, -1]
 
 
 @pytest.fixture(scope="module", autouse=True)

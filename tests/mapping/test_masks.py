@@ -58,8 +58,15 @@ def test_flat_masks_of_photographs_with_one_name_in_two_folders_are_not_guessed(
     cv2.imwrite(str(tmp_path / "b.png"), right_half(8, 4))
     with pytest.raises(InputError, match="a mask of none of the 2 photographs; it holds 'b"):
         Masks.of(tmp_path, ["left/b.jpg", "right/b.jpg"])
-    with pytest.raises(InputError, match="not a folder of masks"):
-        Masks.of(tmp_path / "b.png", ["b.jpg"])
+    with pytest.raises(InputError, match="not a folder of masks, nor a mask"):
+        Masks.of(tmp_path / "none.png", ["left/b.jpg"])
+
+
+def test_a_file_is_the_mask_of_all_photographs(tmp_path):
+    cv2.imwrite(str(tmp_path / "b.png"), right_half(8, 4))
+    found = Masks.of(tmp_path / "b.png", ["left/b.jpg", "right/b.jpg"])
+    for name in ("left/b.jpg", "right/b.jpg"):
+        np.testing.assert_array_equal(found.read(name, (8, 4)), right_half(8, 4) > 0)
 
 
 def test_black_of_jpeg_is_inexact(tmp_path):

@@ -9,14 +9,17 @@ import numpy as np
 import pytest
 
 from groma.errors import InputError
+from groma.io.colmap.masks import Masks
+from groma.io.sequences.images import images_in
+from groma.localization.map_images import image_paths
 from groma.mapping.photographs import (
     check_names,
     copies_among,
     copies_left_out,
     image_files,
+    other_images,
     read_gray,
     smaller_copies,
-    unread_photographs,
 )
 
 
@@ -56,6 +59,20 @@ def test_folders_are_looked_into_unless_they_are_hidden(tmp_path):
         "b/1.jpg",
         "b/c/2.JPG",
     ]
+
+
+def test_links_to_folders_are_followed_once(tmp_path):
+    """A link to what is there anyway adds nothing, nor does one to the folder itself, or above it."""
+    for name in ("photos/a/1.png", "elsewhere/2.png", "elsewhere/deep/3.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    photos = tmp_path / "photos"
+    for link, target in (("rgb", "elsewhere"), ("0", "photos/a"), ("again", "photos"), ("up", ".")):
+        (photos / link).symlink_to(tmp_path / target)
+    (tmp_path / "elsewhere/back").symlink_to(photos)
+    found = [path.relative_to(photos).as_posix() for path in image_files(photos)]
+    assert found == ["a/1.png", "rgb/2.png", "rgb/deep/3.png"]
+    assert image_paths(["2.png"], photos) == [photos / "rgb/2.png"]
 
 
 def test_copies_are_no_further_photographs(tmp_path):
@@ -110,10 +127,21 @@ def test_photographs_that_are_not_read_are_told(tmp_path):
     names = [path.name for path in image_files(tmp_path)]
     assert names == ["c.jpg", "d.JPG"]
     said = "2 photographs of a kind that is not read: a.HEIC, b.heic. Convert them to JPEG or PNG."
-    assert (
-        unread_photographs(tmp_path, names) == [said]
-        and unread_photographs(tmp_path, ["a.jpg", "b.jpg", "c.jpg"]) == []
-    )
+    assert other_images(tmp_path, names) == [said] and other_images(tmp_path, ["a.jpg", "b.jpg", "c.jpg"]) == []
+
+
+def test_masks_beside_photographs_are_no_photographs(tmp_path):
+    masks = ["a_mask.png", "b/c.jpg.png"]
+    for name in ("a.jpg", "b/c.jpg", "the_mask.png", "d.png", *masks):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    names = [path.relative_to(tmp_path).as_posix() for path in image_files(tmp_path)]
+    assert names == ["a.jpg", "b/c.jpg", "d.png", "the_mask.png"]
+    said = f"2 images beside photographs are not mapped, but taken for their masks ({', '.join(masks)})"
+    assert other_images(tmp_path, names) == [f"{said}; --masks {tmp_path} uses them."]
+    # as masks they are found where they are, and no photograph is its own
+    assert Masks.of(tmp_path, names).file_of == {"a.jpg": tmp_path / masks[0], "b/c.jpg": tmp_path / masks[1]}
+    assert images_in(tmp_path) == [tmp_path / name for name in ("a.jpg", "d.png", "the_mask.png")]
 
 
 def test_the_whole_disk_is_no_folder_of_images(monkeypatch):

@@ -39,7 +39,7 @@ from groma.adjustment.survey.best_fit import best_fitted
 from groma.adjustment.terms.contract import Term
 from groma.adjustment.terms.objects import with_held_states
 from groma.adjustment.terms.principal_points import near_the_middle_if_guessed
-from groma.errors import InputError
+from groma.errors import InputError, given_or_default
 from groma.factors.losses import GemanMcClure, Loss, Trivial
 from groma.factors.losses import loss as make_loss
 from groma.problem.lay_out import Layouts
@@ -158,7 +158,7 @@ def adjust(
     InputError
         If the scene has nothing to adjust, or an option is not known.
     """
-    options = options or AdjustOptions()
+    options = given_or_default(options, AdjustOptions)
     check_scene_given(scene)
     refuse_focal_lengths(scene)
     if options.camera_model is not None:

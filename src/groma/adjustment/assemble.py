@@ -39,6 +39,7 @@ from groma.adjustment.terms.objects import with_held
 from groma.adjustment.terms.open_motions import coordinates_to_hold
 from groma.adjustment.terms.readout import MOTIONS
 from groma.cameras import model as camera_model
+from groma.errors import check_kind
 from groma.geometry import quaternion, se3
 from groma.geometry.charts.line_charts import LINE_CHARTS
 from groma.geometry.charts.plane_charts import PLANE_CHARTS
@@ -49,6 +50,7 @@ from groma.geometry.manifold import Euclidean
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.scene import Scene
+from groma.scene.checks import check_scene_given
 from groma.scene.survey import accepted
 
 #: The kinds of measurements, in the order of their factors.
@@ -119,6 +121,8 @@ def assemble(scene: Scene, options: AssemblyOptions, more: Sequence[Term] = ()) 
         Kinds of measurements besides :data:`TERMS`.
     """
     notes: list[str] = []
+    check_scene_given(scene)
+    check_kind(options, AssemblyOptions, "options", "Make one: AssemblyOptions(...).")
     scene = accepted(scene)
     if options.gauge == "auto":
         options = replace(options, gauge=gauge_of(scene, options))

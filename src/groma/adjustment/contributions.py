@@ -14,7 +14,7 @@ from groma._typing import FloatArray
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult
 from groma.adjustment.uncertainty import position_sigma, uncertainty
-from groma.errors import InputError, ProblemError
+from groma.errors import InputError, ProblemError, given_or_default
 from groma.evaluation.alignment import align_poses, camera_centers
 from groma.evaluation.poses import evaluate_poses
 from groma.scene import Relations, Scene
@@ -100,7 +100,7 @@ def contributions(
         If the scene has no points to begin with, or no image of the reference.
     """
     check_scene_given(scene)
-    options = replace(options or AdjustOptions(), check_lens=False)
+    options = replace(given_or_default(options, AdjustOptions), check_lens=False)
     if not (options.points and scene.num_point_observations):
         raise InputError(
             "Contributions are relative to a point-only adjustment, but the scene has no points. "

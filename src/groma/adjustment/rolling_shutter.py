@@ -30,7 +30,7 @@ from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.misfit.lens import LENS
 from groma.adjustment.report import AdjustResult, Progress
 from groma.adjustment.terms.readout import MOTIONS
-from groma.errors import InputError, ProblemError
+from groma.errors import InputError, ProblemError, given_or_default
 from groma.gates import NORMAL, chi_square_gate, gate
 from groma.geometry import quaternion
 from groma.problem.problem import Problem
@@ -192,7 +192,7 @@ def adjust_rolling_shutter(
     options, progress
         As for :func:`groma.adjust`.
     """
-    options = options or AdjustOptions()
+    options = given_or_default(options, AdjustOptions)
     at_once = adjust(scene.replace(camera_motions=CameraMotions()), options, progress)
     start = scene.camera_motions.sigma[0, [0, 3]]
     quick = replace(options, check_lens=False)

@@ -16,7 +16,7 @@ from groma.adjustment.moved_problem import problem_at
 from groma.adjustment.terms.camera_poses import held_scale
 from groma.adjustment.terms.objects import with_held
 from groma.adjustment.terms.principal_points import with_principal_points_known_to
-from groma.errors import InputError, ProblemError
+from groma.errors import InputError, ProblemError, check_kind
 from groma.geometry import so3
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
@@ -120,7 +120,9 @@ def uncertainty(
     check_scene_given(scene)
     if gauge not in ("auto", "inner", "held"):
         raise InputError(f"gauge must be 'auto', 'inner' or 'held'; got {gauge!r}.")
-    options, near = options or AssemblyOptions(refine_intrinsics=None, refine_principal_point=None), local_frame(scene)
+    options = AssemblyOptions(refine_intrinsics=None, refine_principal_point=None) if options is None else options
+    check_kind(options, AssemblyOptions, "options", "Make one: AssemblyOptions(...), or leave it out.")
+    near = local_frame(scene)
     if near is None:
         return _uncertainty(scene, options, gauge, sigma0, problem)
     moved = scene.transformed(near)

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from groma.bounded.text import shown
-from groma.errors import FileFormatError
+from groma.errors import FileFormatError, InputError
 
 #: Endings of the names of images and videos, in lower case.
 IMAGES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
@@ -46,6 +46,43 @@ def listed_file(folder: Path, name: str, place: object) -> Path:
             "Move the file into the folder, or link to it from there."
         )
     return folder / name
+
+
+def existing(path: str | os.PathLike[str]) -> Path:
+    """Return ``path`` as a Path, or raise when there is nothing."""
+    place = Path(path)
+    try:
+        place.stat()
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"Cannot read {place}: {reason}. Check the path.") from error
+    return place
+
+
+def files_below(folder: Path) -> list[Path]:
+    """Return the files in a folder and its sub-folders, sorted; hidden ones are skipped.
+
+    Links to folders are followed, unless what they lead to is found without them, or contains the folder.
+    """
+    files: list[Path] = []
+    seen, starts = {os.path.realpath(above) for above in folder.resolve().parents}, [folder]
+    for start in starts:
+        for place, folders, names in os.walk(start):
+            folders[:] = sorted(name for name in folders if not name.startswith("."))
+            if (real := os.path.realpath(place)) in seen:
+                folders.clear()
+                continue
+            seen.add(real)
+            starts += [path for name in folders if (path := Path(place, name)).is_symlink()]
+            files += [path for name in names if not name.startswith(".") and (path := Path(place, name)).is_file()]
+    return sorted(files)
+
+
+def masks_among(names: Iterable[str]) -> set[str]:
+    """Return those of some names of images that are masks of others: ``a_mask.png`` or ``a.jpg.png`` of ``a.jpg``."""
+    stems = {name: os.path.splitext(name)[0] for name in names}
+    plain = set(stems.values())
+    return {n for n, s in stems.items() if s in stems or (s.endswith("_mask") and s.removesuffix("_mask") in plain)}
 
 
 def outside(names: Iterable[str]) -> list[str]:

@@ -27,7 +27,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.errors import InputError, ShapeError
+from groma.errors import InputError, ShapeError, given_or_default
 from groma.estimators._direction_features import Perpendicular, crossings
 from groma.estimators._parallel_lines import PARALLEL, Acceptance, parallel_lines
 from groma.estimators.association import log10_poisson_tail
@@ -125,7 +125,7 @@ def directions_from_normals(
     ShapeError, InputError
         If shapes do not fit, or a number is not finite.
     """
-    options = options or DirectionOptions()
+    options = given_or_default(options, DirectionOptions)
     normals = vectors(normals, 3, "normals")
     factors = np.asarray(factors, dtype=np.float64)
     if normals.ndim != 2 or factors.shape != (len(normals), 3, 2):
@@ -166,7 +166,7 @@ def directions_from_lines(
     ShapeError, InputError
         If shapes do not fit, or a number is not finite.
     """
-    options = options or DirectionOptions()
+    options = given_or_default(options, DirectionOptions)
     directions = vectors(directions, 3, "directions")
     covariance = np.asarray(covariance, dtype=np.float64)
     if directions.ndim != 2 or covariance.shape != (len(directions), 3, 3):

@@ -39,7 +39,7 @@ from heapq import heappop, heappush
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.errors import InputError, ShapeError
+from groma.errors import InputError, ShapeError, given_or_default
 from groma.estimators._plane_candidates import (
     Features,
     Scores,
@@ -143,7 +143,7 @@ def find_planes(
     ShapeError, InputError
         If shapes do not fit or numbers are not finite.
     """
-    options = options or PlaneOptions()
+    options = given_or_default(options, PlaneOptions)
     points = vectors(points, 3, "points")
     ends = np.zeros((0, 2, 3)) if segments is None else vectors(segments, 3, "segments")
     end_noise = np.zeros((0, 2, 3, 3)) if segment_covariances is None else np.asarray(segment_covariances, float)

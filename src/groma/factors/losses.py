@@ -46,7 +46,7 @@ from numba.extending import overload
 from groma._kernels.digest import ByLength
 from groma._numba import exact_kernel, kernel, loop
 from groma._typing import FloatArray
-from groma.errors import InputError, did_you_mean
+from groma.errors import InputError, check_kind, did_you_mean
 
 _SMALL = 1e-8  # below this, Barron's alpha or 2 - alpha counts as zero
 
@@ -344,6 +344,7 @@ def loss(name: str, scale: float = 1.0, *, alpha: float | None = None) -> Loss:
     InputError
         If there is no such loss, or a parameter is out of range.
     """
+    check_kind(name, str, "name", "Pass the name of a loss, such as huber.")
     key = name.lower().replace("-", "_")
     key = "trivial" if key == "none" else key
     if key not in LOSSES:

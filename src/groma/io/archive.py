@@ -23,11 +23,12 @@ import numpy as np
 import numpy.typing as npt
 
 from groma.bounded.arrays import ArrayMembers, Header, opened_arrays
+from groma.bounded.names import existing
 from groma.bounded.text import shown
 from groma.errors import FileFormatError
 from groma.io.atomic import atomic_output
 from groma.io.colmap.files import is_model
-from groma.io.reading import existing, reading
+from groma.io.reading import reading
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Distances, Scene
 from groma.scene.checks import check_scene_given

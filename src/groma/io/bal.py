@@ -25,11 +25,12 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.bounded.content import read_content
+from groma.bounded.names import existing
 from groma.errors import FileFormatError, InputError, OutputError
 from groma.geometry import quaternion
 from groma.io.atomic import atomic_output
 from groma.io.pose_conventions import BAL, FLIP
-from groma.io.reading import existing, reading
+from groma.io.reading import reading
 from groma.io.registry import HEAD_BYTES, SceneFormat, register_format
 from groma.scene import Cameras, PointObservations, Points, Scene
 from groma.scene.checks import check_scene_given

@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from groma.bounded.arrays import Array, Header, opened_arrays, read_array
 from groma.bounded.images import decoded
+from groma.bounded.names import files_below
 from groma.errors import FileFormatError, InputError
 from groma.io.reading import reading
 
@@ -66,8 +67,8 @@ class DepthMaps:
         if not self.folder.is_dir():
             raise InputError(f"{self.folder} is not a folder of depth maps ({', '.join(ENDINGS)}). Check the path.")
         maps: dict[str, list[Path]] = {}
-        for path in sorted(self.folder.rglob("*")):
-            if path.suffix.lower() in ENDINGS and path.is_file():
+        for path in files_below(self.folder):
+            if path.suffix.lower() in ENDINGS:
                 name = path.relative_to(self.folder).as_posix()
                 key = PurePosixPath(name.removesuffix(_COLMAP[0]).removesuffix(_COLMAP[1])).with_suffix("").as_posix()
                 if not (name.endswith(_COLMAP[1]) and key in maps):

@@ -43,12 +43,13 @@ import numpy as np
 
 from groma._counted import counted
 from groma._typing import FloatArray, IntArray
+from groma.bounded.names import existing
 from groma.bounded.text import finite, read_words
 from groma.errors import FileFormatError
 from groma.geometry import quaternion
 from groma.io.atomic import atomic_output
 from groma.io.pose_conventions import G2O
-from groma.io.reading import existing, reading
+from groma.io.reading import reading
 from groma.scene.pose_graph import GraphPoses, Motions, PoseGraph
 
 #: Numbers after the tag.

@@ -13,9 +13,10 @@ import numpy.typing as npt
 
 from groma._typing import FloatArray
 from groma.bounded.content import read_content
+from groma.bounded.names import existing
 from groma.errors import FileFormatError
 from groma.io.geometry import Geometry
-from groma.io.reading import existing, reading
+from groma.io.reading import reading
 
 #: PLY's names of numbers.
 _PLY_TYPES = {

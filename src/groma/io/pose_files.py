@@ -31,6 +31,7 @@ import numpy as np
 from groma._counted import counted, natural_key
 from groma._image_names import SEVERAL, rows_by_name, tell_partly
 from groma._typing import FloatArray, IntArray
+from groma.bounded.names import existing
 from groma.bounded.text import read_lines
 from groma.errors import InputError
 from groma.geometry import se3
@@ -38,7 +39,7 @@ from groma.io.g2o import looks_like_g2o, read_g2o
 from groma.io.interchange.calibration import camera_table, shared
 from groma.io.interchange.llff import MAGIC, read_llff
 from groma.io.pose_conventions import NAMED
-from groma.io.reading import existing, reading
+from groma.io.reading import reading
 from groma.io.registry import HEAD_BYTES, formats, read_scene
 from groma.io.survey.rows import is_measured_poses, read_measured_poses
 from groma.io.trajectories import read_trajectory

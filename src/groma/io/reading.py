@@ -5,7 +5,6 @@ import os
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 
 from groma._counted import counted
 from groma.errors import FileFormatError, GromaError, InputError
@@ -55,14 +54,3 @@ def warn_of_the_others(path: str | os.PathLike[str], num_images: Sequence[int], 
             f"({largest:,}{where}) is read, {rest} not.",
             stacklevel=3,
         )
-
-
-def existing(path: str | os.PathLike[str]) -> Path:
-    """Return ``path`` as a Path, or raise when there is nothing."""
-    place = Path(path)
-    try:
-        place.stat()
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"Cannot read {place}: {reason}. Check the path.") from error
-    return place

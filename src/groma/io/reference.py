@@ -28,11 +28,12 @@ import numpy.typing as npt
 from groma._counted import counted
 from groma._typing import FloatArray, IntArray
 from groma.bounded.arrays import opened_arrays, read_array
+from groma.bounded.names import existing
 from groma.bounded.text import finite, read_words, whole
 from groma.errors import FileFormatError
 from groma.io.geometry import Geometry
 from groma.io.ply_tables import ply_tables
-from groma.io.reading import existing, reading
+from groma.io.reading import reading
 
 _KIND = "reference"
 #: Pairs of vertices, and triangles.

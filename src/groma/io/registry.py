@@ -13,9 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from groma.bounded.names import existing
 from groma.errors import FileFormatError, GromaError, InputError
 from groma.io.g2o import looks_like_g2o
-from groma.io.reading import existing, reading
+from groma.io.reading import reading
 from groma.io.trajectories import read_trajectory
 from groma.scene import Scene
 from groma.scene.checks import check_scene_given

@@ -25,12 +25,13 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
+from groma.bounded.names import existing
 from groma.bounded.text import finite, read_lines
 from groma.errors import FileFormatError, InputError, ShapeError
 from groma.geometry import se3
 from groma.io.atomic import atomic_output
 from groma.io.pose_conventions import EUROC, KITTI, TUM
-from groma.io.reading import existing, reading
+from groma.io.reading import reading
 from groma.scene.table import Table, column
 
 #: Lines of a pose in the format .log: its numbers, and a matrix of 4x4.

@@ -19,7 +19,7 @@ import numpy as np
 
 from groma._numba import loop
 from groma._rows import distinct
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.localization.landmarks import counted_in
 from groma.localization.map_index import MapIndex
 from groma.localization.pose.camera import QueryCamera
@@ -28,6 +28,7 @@ from groma.localization.pose.matches import Matches
 from groma.localization.pose.refinement import Refined
 from groma.localization.pose.verdict import Shown
 from groma.localization.repeated import ALIKE
+from groma.mapping.image_segments import is_used
 from groma.scene import Scene
 
 #: Images of a map that are asked how often points are found again, at most (cost: time).
@@ -92,6 +93,7 @@ def shown_of(
     matches: Matches,
     found: tuple[IntArray, IntArray],
     lines: bool = True,
+    used: BoolArray | None = None,
 ) -> Shown:
     """Return how much of what a pose puts into an image is there.
 
@@ -108,6 +110,8 @@ def shown_of(
         those that are described more alike than any other place.
     lines
         Whether lines were looked for.
+    used
+        (H, W) where anything was looked for; None: everywhere.
     """
     camera, side = best.camera, max(best.camera.width, best.camera.height) / VERDICT.parts
     ends = matches.segments2d[best.line_inliers]
@@ -115,13 +119,18 @@ def shown_of(
     point, times = _seen_by(index, near)
     pixel = camera.project(best.pose, index.xyz[point])
     inside = camera.inside(pixel)
+    if used is not None:
+        inside[inside] = is_used(used, pixel[inside])
     point, pixel, telling = point[inside], pixel[inside], index.telling[point[inside]]
     rate = again.rate[(telling >= ALIKE).astype(np.int64), times[inside]]
     expected = [(pixel, rate, VERDICT.expected)]
     if lines and scene.num_lines:
         rows = np.concatenate([np.arange(int(index.segment_begin[i]), int(index.segment_begin[i + 1])) for i in near])
         known = distinct(scene.line_observations.line_idx[index.segment[rows]], scene.num_lines)[0]
-        expected.append((*_lengths(camera, best.pose, scene.lines.segments[known]), 0.5 * side))
+        middle, length = _lengths(camera, best.pose, scene.lines.segments[known])
+        if used is not None:
+            length = np.where(is_used(used, np.nan_to_num(middle)), length, 0.0)
+        expected.append((middle, length, 0.5 * side))
     parts = _counted(camera, expected, shown, VERDICT.parts)
     alike, itself = (np.isin(point, some) for some in found)
     often = min(1.0, float(alike.sum()) / max(float(rate.sum()), 1e-12))

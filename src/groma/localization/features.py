@@ -27,7 +27,7 @@ from groma.features.segments import Segments
 from groma.features.sift import Blobs, describe_upright, find_blobs
 from groma.gates import gate
 from groma.localization.pose.camera import QueryCamera
-from groma.mapping.image_segments import Straightener
+from groma.mapping.image_segments import Straightener, is_used, segments_used
 
 Bytes = npt.NDArray[np.uint8]
 #: A descriptor of length one, in bytes, has about this length (the format of COLMAP's descriptors).
@@ -98,6 +98,8 @@ class DescribedImage:
     segments: Segments
     #: (m, 72) of the segments.
     segment_descriptors: Descriptors
+    #: (H, W) what may be used of the image; None: all.
+    used: BoolArray | None = None
 
     def with_points(self, points: DescribedPoints) -> DescribedImage:
         """The same segments, and other points."""
@@ -160,17 +162,24 @@ def summed(descriptors: Bytes, owner: IntArray, count: int) -> npt.NDArray[np.fl
 
 
 def find_features(
-    image: GrayImage, camera: QueryCamera, lines: bool = True, min_length: float = MIN_LENGTH
+    image: GrayImage,
+    camera: QueryCamera,
+    lines: bool = True,
+    min_length: float = MIN_LENGTH,
+    used: BoolArray | None = None,
 ) -> DescribedImage:
-    """Find and describe points and segments; segments without the distortion of the lens."""
+    """Find and describe points and segments in what is used (H, W); segments without the distortion of the lens."""
 
     def segments() -> tuple[Segments, Descriptors]:
         detector = DETECTORS.make("lsd", min_length=min_length, max_segments=0)
         found = _segments(image, camera, detector) if lines else Segments.empty()
+        found = found if used is None else segments_used(found, used)
         return found, describe(image, found)
 
     points, found = together(lambda: find_points(image).joined(find_corners(image)), segments)
-    return DescribedImage(points, *found)
+    if used is not None:
+        points = points.take(is_used(used, points.pixels))
+    return DescribedImage(points, *found, used)
 
 
 def _segments(image: GrayImage, camera: QueryCamera, detector: SegmentDetector) -> Segments:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from groma._log import log_warnings, logged_stages
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.errors import InputError
+from groma.errors import InputError, ShapeError, check_kind, given_or_default
 from groma.features.images import GrayImage, to_gray
 from groma.gates import gate
 from groma.io import read_scene
@@ -46,7 +46,7 @@ from groma.localization.pose.absolute_pose import (
     PoseOptions,
     pose_from_matches,
 )
-from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.camera import CAMERA_WAY, QueryCamera
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.refinement import Refined
@@ -132,7 +132,7 @@ class Localizer:
         progress: Callable[[str, int, int], None] | None = None,
     ) -> None:
         say = logged_stages("localization", progress)
-        self.options = options or LocalizeOptions()
+        self.options = given_or_default(options, LocalizeOptions)
         self.scene = map_ if isinstance(map_, Scene) else read_scene(map_)
         check_map(self.scene)
         if index is None and not isinstance(map_, Scene):
@@ -176,6 +176,7 @@ class Localizer:
         image: str | os.PathLike[str] | npt.NDArray[np.generic],
         camera: QueryCamera | None = None,
         refine_lens: bool = False,
+        used: BoolArray | None = None,
     ) -> LocalizedImage:
         """Find where a photograph was taken.
 
@@ -187,6 +188,8 @@ class Localizer:
             Its calibration; by default that of the map for images of this size, else it is estimated.
         refine_lens : bool
             Estimate focal length and distortion, from those of the camera.
+        used : (H, W) bool, optional
+            What may be used of the photograph, as of its mask; by default all.
         """
         gray = to_gray(image) if isinstance(image, np.ndarray) else read_gray(Path(image))
         height, width = gray.shape
@@ -195,17 +198,22 @@ class Localizer:
         if camera is None:
             camera = unknown_camera(width, height)
             options = replace(options, refine_lens=True, focal_factors=UNKNOWN_LENS)
+        check_kind(camera, QueryCamera, "camera", CAMERA_WAY)
         if (camera.width, camera.height) != (width, height):
             raise InputError(
                 f"The image has {width}x{height} pixels, its camera {camera.width}x{camera.height}. Pass the "
                 "calibration of this size."
             )
-        return self._localize(gray, camera, options)
+        if used is not None and used.shape != gray.shape:
+            raise ShapeError(f"used must have the shape of the image, {gray.shape}; got {used.shape}.")
+        return self._localize(gray, camera, options, used)
 
-    def _localize(self, gray: GrayImage, camera: QueryCamera, options: PoseOptions) -> LocalizedImage:
+    def _localize(
+        self, gray: GrayImage, camera: QueryCamera, options: PoseOptions, used: BoolArray | None
+    ) -> LocalizedImage:
         start = time.perf_counter()
         with one_blas_thread():
-            query = find_features(gray, camera, self.options.lines, self.options.min_segment_length)
+            query = find_features(gray, camera, self.options.lines, self.options.min_segment_length, used)
             described = time.perf_counter()
             images = self._alike(query.points)
             pose, last = self._coarsely(query, camera, options, images)
@@ -280,7 +288,9 @@ class Localizer:
             limit = self._alike_limits[self._landmarks.upright[agreeing].astype(np.int64)]
             alike = agreeing[distance <= limit], agreeing[distance <= self.index.within[agreeing]]
             around = nearest_images(self.index, images, agreeing, self.options.gates.near)
-            return shown_of(self.scene, self.index, self._again, around, best, used, alike, self.options.lines)
+            return shown_of(
+                self.scene, self.index, self._again, around, best, used, alike, self.options.lines, query.used
+            )
 
         def telling(used: Matches) -> BoolArray:
             return seen_in_them(used).telling(part, self.index)

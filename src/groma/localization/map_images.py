@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from groma.bounded.documents import read_document
-from groma.bounded.names import IMAGES, stays_inside
+from groma.bounded.names import IMAGES, files_below, stays_inside
 from groma.errors import GromaError, InputError
 
 #: How the folder of a map's photographs is passed.
@@ -28,7 +28,7 @@ def image_paths(names: Sequence[str], folder: Path) -> list[Path]:
     found = [folder / name if stays_inside(name) else Path() for name in names]
     missing = [row for row, path in enumerate(found) if not path.is_file()]
     below: defaultdict[str, list[Path]] = defaultdict(list)
-    for path in folder.rglob("*") if missing else ():
+    for path in files_below(folder) if missing else ():
         if path.suffix.lower() in IMAGES:
             below[path.name].append(path)
     for row in missing:

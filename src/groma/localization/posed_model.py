@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 from collections.abc import Mapping, Sequence
@@ -17,12 +18,14 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.bounded.names import stays_inside
 from groma.errors import InputError
 from groma.execution import map_work
+from groma.gates import NORMAL, chi_square_gate
 from groma.localization.features import DescribedPoints, find_corners, find_points
 from groma.localization.map_index import MapIndex, Progress
 from groma.localization.registered import with_queries
 from groma.localization.retrieval import VladRetrieval
 from groma.localization.stored import StoredImage
 from groma.localization.triangulation import triangulate_features
+from groma.mapping.noise.landmarks import pixels_of
 from groma.mapping.photographs import read_gray
 from groma.scene import Keypoints, PointObservations, Points, Scene
 from groma.scene.table import joined
@@ -39,7 +42,8 @@ def with_photographs(
     """Return a map with more photographs, and points that tie them to it and to each other.
 
     Features of all photographs are matched and triangulated at the poses as they are. A track through a place where
-    the map observes a point of its own is that point; others that a new photograph sees become points.
+    the map observes a point of its own is that point, if it is at the place of all its features; others that a new
+    photograph sees become points.
 
     Parameters
     ----------
@@ -65,7 +69,8 @@ def with_photographs(
     image, track = image[row], made.point[row]
     pixels, sigma = (np.concatenate([getattr(one, name) for one in features])[row] for name in ("pixels", "sigma"))
     new = image >= scene.num_images
-    own = _own_points(scene, image, pixels, track, len(made.xyz))
+    reach = _SAME_PLACE + math.sqrt(chi_square_gate(NORMAL.outlier, 2)) * made.noise * sigma
+    own = _own_points(both, image, pixels, reach, track, len(made.xyz))
     fresh = (own < 0) & (np.bincount(track[new], minlength=len(made.xyz)) > 0)
     point = np.where(own >= 0, own, both.num_points + np.cumsum(fresh) - 1)[track]
     used = (new & (own[track] >= 0)) | fresh[track]
@@ -87,8 +92,14 @@ def _without_landmarks(one: StoredImage) -> StoredImage:
     return replace(one, point=none, pixel=np.zeros((0, 2)), line=none, segment=np.zeros((0, 4)))
 
 
-def _own_points(scene: Scene, image: IntArray, pixels: FloatArray, track: IntArray, count: int) -> IntArray:
-    """The point (T,) of a map that each of the tracks shows in one of its images; -1 for none."""
+def _own_points(
+    scene: Scene, image: IntArray, pixels: FloatArray, reach: FloatArray, track: IntArray, count: int
+) -> IntArray:
+    """The point (T,) of a map that each of the tracks shows; -1 for none.
+
+    It is at the place of one feature of the track, and within reach of all: at one place of an image there may be
+    points of different depth.
+    """
     seen = scene.point_observations
     own = np.full(count, -1)
     for k in range(scene.num_images):
@@ -98,6 +109,9 @@ def _own_points(scene: Scene, image: IntArray, pixels: FloatArray, track: IntArr
             distance, nearest = np.asarray(near[0]), np.asarray(near[1])
             hit = np.isfinite(distance) & (own[track[ours]] < 0)
             own[track[ours[hit]]] = seen.point_idx[theirs[nearest[hit]]]
+    rows = np.flatnonzero(own[track] >= 0)
+    away = np.linalg.norm(pixels_of(scene, image[rows], scene.points.xyz[own[track[rows]]]) - pixels[rows], axis=1)
+    own[track[rows[~(away <= reach[rows])]]] = -1
     return own
 
 

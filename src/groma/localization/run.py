@@ -13,6 +13,7 @@ from groma._version import __version__
 from groma.bounded.names import IMAGES
 from groma.errors import GromaError, InputError
 from groma.execution import map_work
+from groma.io.colmap.masks import Masks
 from groma.localization.calibration import CalibrationChoice, calibration_of
 from groma.localization.localizer import Localizer
 from groma.localization.map_index import digest_of
@@ -49,6 +50,7 @@ def localize_images(
     work: Path,
     choice: CalibrationChoice | None = None,
     progress: Callable[[str, int, int], None] | None = None,
+    masks: Masks | None = None,
 ) -> list[StoredImage]:
     """Localise photographs.
 
@@ -64,37 +66,43 @@ def localize_images(
         Where calibrations come from.
     progress
         Called with the name of a stage, what is done and what there is to do.
+    masks
+        What may be used of the photographs.
     """
     say, choice = logged_stages("localization", progress), choice or CalibrationChoice()
     told = f"{__version__} {digest_of(localizer.scene, localizer.files)} {localizer.options} {choice}"
     with lock_folder(work), one_blas_thread():
-        one = partial(_kept, localizer, choice, work, told)
+        one = partial(_kept, localizer, choice, masks, work, told)
         return map_work(one, list(files.items()), partial(say, "localising photographs"))
 
 
 def _kept(
-    localizer: Localizer, choice: CalibrationChoice, work: Path, told: str, query: tuple[str, Path]
+    localizer: Localizer, choice: CalibrationChoice, masks: Masks | None, work: Path, told: str, query: tuple[str, Path]
 ) -> StoredImage:
     """Localise a photograph, unless that is done already, and keep the result."""
     name, path = query
     file = work / f"{hashlib.sha256(name.encode()).hexdigest()[:16]}.npz"
-    digest = hashlib.sha256(f"{told} {_state_of(path)}".encode()).hexdigest()
+    mask = None if masks is None else masks.file_of.get(name)
+    digest = hashlib.sha256(f"{told} {_state_of(path)} {mask and _state_of(mask)}".encode()).hexdigest()
     one = read_stored(file, digest)
     if one is None:
-        one = _localize(localizer, name, path, choice)
+        one = _localize(localizer, name, path, choice, masks)
         one.write(file, digest)
     logger_of("localization").info("%s: %s. %s", name, one.status, one.sentence)
     return one
 
 
-def _localize(localizer: Localizer, name: str, path: Path, choice: CalibrationChoice) -> StoredImage:
+def _localize(
+    localizer: Localizer, name: str, path: Path, choice: CalibrationChoice, masks: Masks | None
+) -> StoredImage:
     try:
         image = read_gray(path)
         size = image.shape[1], image.shape[0]
         calibration = calibration_of(
             path, size, localizer.camera_of_map(*size), choice, localizer.photograph_of_map(*size)
         )
-        return stored(name, localizer.localize(image, calibration.camera, calibration.refine))
+        used = None if masks is None else masks.read(name, size)
+        return stored(name, localizer.localize(image, calibration.camera, calibration.refine, used))
     except GromaError as error:
         return unreadable(name, str(error))
 

@@ -143,7 +143,7 @@ def _detect_in(
     straightener = _straightener(model, params, *size)
     found = detector.detect(image) if straightener is None else straightener.detect(detector, image)
     used = None if masks is None else masks.read(name, size)
-    return found if used is None else parts_inside(found, partial(_is_used, _without_border(used)))
+    return found if used is None else segments_used(found, used)
 
 
 def check_masks(
@@ -172,13 +172,15 @@ def _share_used(masks: Masks, photograph: tuple[str, tuple[int, int]]) -> float:
     return 1.0 if used is None else float(used.mean())
 
 
-def _without_border(used: BoolArray) -> BoolArray:
-    """What is used, without its border: the outline of what a mask hides is no edge of the scene."""
+def segments_used(found: Segments, used: BoolArray) -> Segments:
+    """Return what of each segment may be used of an image, (H, W): not the outline of what a mask hides."""
     reach = 2 * math.ceil(WIDE.border) + 1
-    return cv2.erode(used.astype(np.uint8), np.ones((reach, reach), np.uint8)).astype(np.bool_)
+    inside = cv2.erode(used.astype(np.uint8), np.ones((reach, reach), np.uint8)).astype(np.bool_)
+    return parts_inside(found, partial(is_used, inside))
 
 
-def _is_used(used: BoolArray, pixels: FloatArray) -> BoolArray:
+def is_used(used: BoolArray, pixels: FloatArray) -> BoolArray:
+    """Return which pixels (N, 2) may be used of an image, (H, W)."""
     column, row = np.clip(pixels, 0, np.array(used.shape[::-1]) - 1).astype(np.int64).T
     return np.asarray(used[row, column])
 

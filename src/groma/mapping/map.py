@@ -33,6 +33,7 @@ from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult
 from groma.adjustment.survey.attach import check_survey
 from groma.adjustment.survey.given import Survey
+from groma.errors import given_or_default
 from groma.execution import begin, work_with
 from groma.features.close_edges import CloseEdges
 from groma.features.contrast import WithContrast
@@ -71,6 +72,7 @@ from groma.mapping.start import start_of
 from groma.mapping.structure.find import LandmarkNoise, detect_structure, landmark_noise
 from groma.mapping.structure.flatness import surface_noise_px, with_rough_planes
 from groma.scene import Scene, Similarity
+from groma.scene.checks import check_scene_given
 from groma.scene.local_frame import usual_frame
 from groma.solver.linear.blas import one_blas_thread
 
@@ -135,9 +137,9 @@ def map_images(
         If another run works in ``work``, or it cannot be written.
     """
     say, folder = logged_stages("mapping", progress), Path(images)
-    options = with_parts(options or MapOptions())
-    files = image_files(folder)
+    options = with_parts(given_or_default(options, MapOptions))
     given, near, options = _in_usual_frame(model, options)
+    files = image_files(folder)
     read_by_rows(given or Scene(), options, depth)  # refuses depths beside it before anything is computed
     alone = model is None and line_matches is None and not options.rigs
     key = begin(partial(digest, __version__, digest_files(folder, files), given))
@@ -180,6 +182,7 @@ def _in_usual_frame(model: Scene | None, options: MapOptions) -> tuple[Scene | N
     """Return a given model near the origin with the camera model asked for, what brought it there, and the options."""
     if model is None:
         return None, None, options
+    check_scene_given(model, "model")
     ready = ready_to_map(model)
     if options.camera_model is not None:
         ready = ready.replace(cameras=ready.cameras.with_model(options.camera_model))

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 import posixpath
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -24,7 +23,7 @@ import numpy as np
 from groma._counted import counted, first_of
 from groma._typing import FloatArray
 from groma.bounded.images import decoded
-from groma.bounded.names import IMAGES, UNREAD, VIDEOS, is_text
+from groma.bounded.names import IMAGES, UNREAD, VIDEOS, files_below, is_text, masks_among
 from groma.bounded.text import shown
 from groma.cameras import model as camera_model
 from groma.errors import FileFormatError, GromaError, InputError
@@ -66,14 +65,16 @@ def image_files(folder: Path) -> list[Path]:
             f"{folder} is the whole disk, not a folder of images: every picture on it would be taken. Pass the folder "
             "that holds the photographs."
         )
-    files = _with_endings(folder, IMAGES)
+    found = _with_endings(folder, IMAGES)
+    masks = masks_among(found)
+    files = [path for name, path in found.items() if name not in masks]
     if not files:
         if others := _with_endings(folder, UNREAD):
-            raise InputError(f"{folder} holds {_of_unread_kind(others, folder)}. Convert them to JPEG or PNG.")
+            raise InputError(f"{folder} holds {_of_unread_kind(others)}. Convert them to JPEG or PNG.")
         if is_model(folder):
             raise InputError(f"{folder} holds a model, but no images. Pass the folder of its photographs.")
         raise InputError(f"{folder} holds no images ({', '.join(IMAGES)}). Check the path.")
-    wrong = next((name for path in files if not is_text(name := path.relative_to(folder).as_posix())), None)
+    wrong = next((name for name in found if not is_text(name)), None)
     if wrong is not None:
         raise InputError(
             f"The name of the image {shown(wrong)} cannot stand in a model: it must be UTF-8, in one line. Rename it."
@@ -81,29 +82,29 @@ def image_files(folder: Path) -> list[Path]:
     return files
 
 
-def _with_endings(folder: Path, endings: tuple[str, ...]) -> list[Path]:
-    files: list[Path] = []
-    for place, folders, names in os.walk(folder):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        pictures = [name for name in names if not name.startswith(".") and name.lower().endswith(endings)]
-        files += [path for name in pictures if (path := Path(place, name)).is_file()]
-    return sorted(files)
+def _with_endings(folder: Path, endings: tuple[str, ...]) -> dict[str, Path]:
+    """The files in a folder and below whose names end so, by name."""
+    files = (path for path in files_below(folder) if path.name.lower().endswith(endings))
+    return {path.relative_to(folder).as_posix(): path for path in files}
 
 
-def _of_unread_kind(files: Sequence[Path], folder: Path) -> str:
-    names = first_of([path.relative_to(folder).as_posix() for path in files], 3)
-    return f"{counted(len(files), 'photographs')} of a kind that is not read: {names}"
+def _of_unread_kind(names: Collection[str]) -> str:
+    return f"{counted(len(names), 'photographs')} of a kind that is not read: {first_of(list(names), 3)}"
 
 
-def unread_photographs(folder: Path, names: Sequence[str]) -> list[str]:
-    """Say which photographs of a folder are of a kind that is not read, in at most one sentence.
+def other_images(folder: Path, names: Sequence[str]) -> list[str]:
+    """Say which files of a folder are photographs of a kind that is not read, and which are masks beside photographs.
 
     A raw file is none of them if the camera wrote a JPEG beside it.
     """
     read = {posixpath.splitext(name)[0] for name in names}
-    others = _with_endings(folder, UNREAD)
-    alone = [path for path in others if path.relative_to(folder).with_suffix("").as_posix() not in read]
-    return [f"{_of_unread_kind(alone, folder)}. Convert them to JPEG or PNG."] if alone else []
+    alone = [name for name in _with_endings(folder, UNREAD) if posixpath.splitext(name)[0] not in read]
+    masks = sorted(masks_among(_with_endings(folder, IMAGES)))
+    of_masks = f"{counted(len(masks), 'images')} beside photographs are not mapped, but taken for their masks"
+    return [
+        *([f"{_of_unread_kind(alone)}. Convert them to JPEG or PNG."] if alone else []),
+        *([f"{of_masks} ({first_of(masks, 3)}); --masks {folder} uses them."] if masks else []),
+    ]
 
 
 def content_digest(path: Path) -> str:
@@ -304,9 +305,9 @@ def photographs_left_out(
 ) -> list[str]:
     """Say which photographs of a folder are not in a map, and why, a sentence for each reason."""
     names = [path.relative_to(folder).as_posix() for path in files]
-    unread = [] if model_given else unread_photographs(folder, names)
+    others = [] if model_given else other_images(folder, names)
     rest = [name for name in names if name not in copies]
-    return [*unread, *copies_left_out(copies, len(names)), *images_left_out(rest, used, model_given)]
+    return [*others, *copies_left_out(copies, len(names)), *images_left_out(rest, used, model_given)]
 
 
 def images_left_out(names: Sequence[str], used: Sequence[str], model_given: bool) -> list[str]:

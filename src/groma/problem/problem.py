@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.errors import ProblemError
+from groma.errors import ProblemError, check_kind
 from groma.factors.contract import Factor
 from groma.factors.losses import Loss
 from groma.problem._numbers import refuse_unusable_numbers
@@ -31,6 +31,7 @@ class Problem:
     factors: tuple[Factor, ...]
 
     def __init__(self, variables: Mapping[str, Variables], factors: Iterable[Factor]) -> None:
+        check_kind(variables, Mapping, "variables", "Name the groups: {'points': groma.Variables(manifold, state)}.")
         object.__setattr__(self, "variables", dict(variables))
         object.__setattr__(self, "factors", tuple(factors))
         for factor in self.factors:

@@ -10,7 +10,8 @@ from functools import cached_property
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray
-from groma.errors import ProblemError, ShapeError
+from groma.errors import ProblemError, ShapeError, check_kind
+from groma.geometry.algebra import numbers
 from groma.geometry.manifold import Manifold
 
 
@@ -27,7 +28,8 @@ class Variables:
     constant: bool | BoolArray = False
 
     def __post_init__(self) -> None:
-        state = np.ascontiguousarray(self.state, dtype=np.float64)
+        check_kind(self.manifold, Manifold, "manifold", "Pass a chart, such as groma.geometry.Euclidean(3, 'point').")
+        state = np.ascontiguousarray(numbers(self.state, "state"))
         if state.ndim != 2 or state.shape[1] != self.manifold.state_size:
             raise ShapeError(
                 f"Variables of {self.manifold!r} need a state of shape (count, {self.manifold.state_size}); "

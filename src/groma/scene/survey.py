@@ -44,20 +44,21 @@ DIRECTED = (Kind.IMAGE, Kind.LINE, Kind.PLANE, Kind.DIRECTION)
 _POSE_LENGTHS = ((2, 2, 2, 1, 1, 1),) * 3 + ((1, 1, 1, 0, 0, 0),) * 3
 
 
-def check_covariance(name: str, covariance: FloatArray) -> None:
-    """Raise when a matrix (N, m, m) is not symmetric and positive definite."""
+def check_covariance(name: str, covariance: FloatArray, exact: bool = False) -> None:
+    """Raise when a matrix (N, m, m) is not symmetric and positive definite; ``exact``: semidefinite will do."""
     if len(covariance) == 0:
         return
-    root = np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 1e-300))  # units of coordinates may differ
-    covariance = covariance / root[:, :, None] / root[:, None, :]
+    if not exact:  # units of coordinates may differ; of what is exact, rounding would be scaled up
+        root = np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 1e-300))
+        covariance = covariance / root[:, :, None] / root[:, None, :]
     asymmetry = np.abs(covariance - covariance.transpose(0, 2, 1)).max(axis=(1, 2))
     smallest, size = np.linalg.eigvalsh(covariance)[:, 0], np.abs(covariance).max(axis=(1, 2))
-    wrong = (smallest <= 1e-15 * size) | (asymmetry > 1e-6 * size)
+    wrong = (smallest < -1e-6 * size if exact else smallest <= 1e-15 * size) | (asymmetry > 1e-6 * size)
     if wrong.any():
         row = int(np.argmax(wrong))
         raise InputError(
-            f"{name} must be positive definite covariance matrices; row {row} is {covariance[row].tolist()}. Give what "
-            "is not known a large variance."
+            f"{name} must be symmetric positive {'semi' * exact}definite covariance matrices; row {row} is "
+            f"{covariance[row].tolist()}. Give what is not known a large variance."
         )
 
 

@@ -25,7 +25,7 @@ import numpy as np
 
 from groma._stopwatch import Stopwatch
 from groma._typing import FloatArray
-from groma.errors import check_kind
+from groma.errors import check_kind, given_or_default
 from groma.execution import available_cores
 from groma.problem.lay_out import Layouts
 from groma.problem.layout import Layout
@@ -89,7 +89,7 @@ def solve(
         If a factor couples two landmarks that were both to be eliminated.
     """
     check_kind(problem, Problem, "problem", "Make one: groma.Problem(variables, factors).")
-    options = options or SolverOptions()
+    options = given_or_default(options, SolverOptions)
     report = SolveReport(num_factors=sum(map(len, problem.factors)), num_residuals=problem.num_residuals)
     watch = Stopwatch(report.seconds)
     with watch("setup"):

@@ -17,7 +17,7 @@ import numpy as np
 from groma._counted import counted
 from groma._log import log_warnings, logged_stages, logger_of
 from groma.bounded.json_text import json_text
-from groma.errors import GromaError, InputError, is_interrupt
+from groma.errors import GromaError, InputError, check_kind, given_or_default, is_interrupt
 from groma.evaluation.trajectory import TrajectoryScores, score_trajectory
 from groma.io import atomic_output, write_scene
 from groma.io.sequences import Sequence, open_sequence
@@ -195,6 +195,7 @@ def track(
         name = name or os.fspath(sequence)
         source = source or FrameSource.of(sequence)
         sequence = open_sequence(sequence)
+    check_kind(sequence, Sequence, "sequence", "Open one with groma.open_sequence(path), or pass the path.")
     progress = _logged(progress)
     earlier = None if map_ is None else read_saved_map(map_)
     tracker = Tracker(sequence.camera, options, saved=_loaded(earlier, sequence, options, progress))
@@ -262,7 +263,7 @@ def _loaded(
         progress(TrackProgress("reading the map", done, total))
 
     camera = TrackCamera.of(sequence.camera)
-    return earlier.track_map(camera, sequence.kind != "mono", options or TrackOptions(), say)
+    return earlier.track_map(camera, sequence.kind != "mono", given_or_default(options, TrackOptions), say)
 
 
 def _follow(

@@ -19,7 +19,7 @@ import numpy as np
 
 from groma._stopwatch import Stopwatch
 from groma._typing import FloatArray
-from groma.errors import InputError
+from groma.errors import InputError, check_kind, given_or_default
 from groma.execution import work_with
 from groma.geometry import se3
 from groma.io.sequences.frame import Frame, SequenceCamera
@@ -76,7 +76,8 @@ class Tracker:
         self, camera: SequenceCamera, options: TrackOptions | None = None, right_turn: RightTurn | None = None,
         saved: TrackMap | None = None,
     ) -> None:  # fmt: skip
-        self.options = options or TrackOptions()
+        self.options = given_or_default(options, TrackOptions)
+        check_kind(camera, SequenceCamera, "camera", "Pass the camera of a sequence: groma.open_sequence(path).camera.")
         self._given, self.camera = camera, TrackCamera.of(camera)
         self.status = STARTING
         self._gates = self.options.gates.verification

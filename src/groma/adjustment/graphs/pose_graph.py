@@ -13,21 +13,23 @@ together in linear systems (:mod:`groma.adjustment.graphs.linear_start`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from groma._counted import counted
+from groma._counted import counted, first_of
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.graphs.linear_start import linear_start
 from groma.adjustment.report import Progress, not_converged
-from groma.errors import InputError, check_kind
+from groma.errors import InputError, check_kind, given_or_default
 from groma.factors.contract import Ref
 from groma.factors.losses import Loss, Trivial
 from groma.factors.losses import loss as make_loss
 from groma.factors.priors.pose_between import PoseBetween
+from groma.gates import NORMAL, chi_square_gate
 from groma.geometry import se3
 from groma.geometry.charts.pose_charts import POSE_CHARTS
 from groma.problem.problem import Problem
@@ -86,10 +88,35 @@ class PoseGraphResult:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Sentences for the user."""
-        said = (*not_converged(self.report), *self.report.warnings)
-        if self.num_parts == 1:
-            return said
-        return (*said, f"The graph falls into {self.num_parts} parts; each keeps the frame of its held or first pose.")
+        said = [*not_converged(self.report), *self.report.warnings, *self._contradictions()]
+        if self.num_parts > 1:
+            said.append(f"The graph falls into {self.num_parts} parts; each keeps the frame of its held or first pose.")
+        return tuple(said)
+
+    @property
+    def noise(self) -> float:
+        """Noise of the motions that are no outliers, in units of what they state; NaN where all are needed."""
+        held = np.bincount(self.graph.parts(), self.graph.poses.held)
+        free = len(self.graph.poses) - int(np.maximum(held, 1.0).sum())
+        kept = np.delete(np.arange(len(self.chi_square)), self.outliers)
+        measured = int(np.linalg.matrix_rank(self.graph.motions.information[kept], hermitian=True).sum())
+        redundancy = measured - (3 if self.graph.planar else 6) * free
+        return float(np.sqrt(self.chi_square[kept].sum() / redundancy)) if redundancy > 0 else math.nan
+
+    def _contradictions(self) -> list[str]:
+        """Say which motions err by more than the noise that they state explains in a graph of so many."""
+        motions, ids = self.graph.motions, self.graph.poses.ids
+        limit = chi_square_gate(NORMAL.false_alarm / len(motions), 3 if self.graph.planar else 6)
+        wrong = np.setdiff1d(np.flatnonzero(self.chi_square > limit), self.outliers)
+        if not self.report.converged or not len(wrong):
+            return []
+        worst = wrong[np.argsort(-self.chi_square[wrong], kind="stable")]
+        named = [f"{ids[motions.first_idx[k]]}-{ids[motions.second_idx[k]]} ({self.chi_square[k]:.3g})" for k in worst]
+        return [
+            f"{len(wrong):,} of {counted(len(motions), 'motions')} contradict the others by more than their stated "
+            f"noise explains (chi-square beyond {limit:.3g}): {first_of(named, 3)}. If single ones are "
+            "wrong, use --loss geman_mcclure; if most are, the file states too little noise."
+        ]
 
     def summary(self) -> dict[str, Any]:
         """Return all numbers as plain values, as ``groma adjust --json`` writes them."""
@@ -108,6 +135,7 @@ class PoseGraphResult:
             "converged": report.converged,
             "linear_solver": report.linear_solver,
             "seconds": dict(report.seconds),
+            "noise": self.noise if math.isfinite(self.noise) else None,
             "chi_square": {"before": float(self.chi_square_before.sum()), "after": float(self.chi_square.sum())},
             "outlier_motions": [
                 [int(ids[motions.first_idx[row]]), int(ids[motions.second_idx[row]])] for row in self.outliers
@@ -136,7 +164,7 @@ def adjust_pose_graph(
         If the graph has no motions.
     """
     check_kind(graph, PoseGraph, "graph", "Read one with groma.io.read_g2o(path).")
-    options = options or PoseGraphOptions()
+    options = given_or_default(options, PoseGraphOptions)
     if not len(graph.motions):
         poses = counted(len(graph.poses), "poses")
         raise InputError(f"The graph has {poses} and no motions between them; nothing to adjust.")
@@ -170,7 +198,7 @@ def adjust_pose_graph(
 
 def pose_graph_problem(graph: PoseGraph, options: PoseGraphOptions | None = None) -> Problem:
     """Return the problem of a graph: ``poses`` (body_from_world), motions without, and motions with a loss."""
-    options = options or PoseGraphOptions()
+    options = given_or_default(options, PoseGraphOptions)
     part, held = graph.parts(), graph.poses.held
     has_held = np.zeros(part.max(initial=-1) + 1, dtype=bool)
     has_held[part[held]] = True

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.errors import InputError, ShapeError
+from groma.errors import InputError, ShapeError, given_or_default
 from groma.factors.contract import Ref
 from groma.factors.priors.similarity_between import SimilarityBetween
 from groma.geometry.charts.similarity import SIMILARITY_CHARTS
@@ -98,6 +98,6 @@ def adjust_similarity_graph(
         sqrt_information=np.asarray(np.linalg.inv(np.linalg.cholesky(motions.covariance)), np.float64),
     )
     cameras = Variables(SIMILARITY_CHARTS["left"], cam_from_world, np.arange(count) == 0)
-    solution = solve(Problem({"cameras": cameras}, [factor]), options or SolverOptions())
+    solution = solve(Problem({"cameras": cameras}, [factor]), given_or_default(options, SolverOptions))
     squares = squared_norms(factor, solution.problem.variables)
     return SimilarityGraphResult(solution["cameras"], squares, solution.report)

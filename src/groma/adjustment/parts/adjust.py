@@ -28,7 +28,7 @@ from groma.adjustment.parts.memory import room_for_parts
 from groma.adjustment.parts.opened import open_parts
 from groma.adjustment.parts.run import Run, Solved, Squares, Written
 from groma.adjustment.report import AdjustReport, not_converged
-from groma.errors import InputError, OutputError
+from groma.errors import InputError, OutputError, given_or_default
 from groma.factors.losses import Loss, Trivial
 from groma.solver.linear.blas import one_blas_thread
 from groma.solver.options import SolverOptions
@@ -99,7 +99,7 @@ def adjust_parts(
     OutputError
         If archives exist in ``output`` already, or cannot be written.
     """
-    reducer, options = reducer or SingleProcess(), options or SolverOptions()
+    reducer, options = reducer or SingleProcess(), given_or_default(options, SolverOptions)
     chosen = AssemblyOptions(**assembly)  # type: ignore[arg-type]
     paths = [Path(part) for part in parts]
     with agreed(reducer):

@@ -53,6 +53,10 @@ def localize(
         str | None,
         _options.PLAIN.option("Known camera parameters of the queries, which are held.", metavar="F,CX,CY,..."),
     ] = None,
+    masks: Annotated[
+        Path | None,
+        _options.PLAIN.option("Masks of the queries, as for groma map --masks: black is not used.", metavar="PATH"),
+    ] = None,
     lines: Annotated[bool, _options.PLAIN.option("Use lines in addition to points.")] = True,
     min_length: Annotated[
         float, _options.PLAIN.option("Minimum length of line segments, pixels.", min=5.0, metavar="PX")
@@ -71,7 +75,7 @@ def localize(
     from groma.cli.shared.input import camera_parameters, check_inputs, refuse_idle
 
     _output.check_outputs(force, output, json_target=console.json_target)
-    check_inputs(map_, *queries, images)
+    check_inputs(map_, *queries, images, masks)
     refuse_idle(
         ("--min-length", min_length != _MIN_LENGTH and not lines, "with lines"),
         ("--calibration", calibration != "auto" and camera_model is not None, "without --camera-model"),
@@ -86,6 +90,7 @@ def localize(
     from groma.execution import work_with
     from groma.features.images import one_opencv_thread
     from groma.io.colmap.files import is_model
+    from groma.io.colmap.masks import Masks
     from groma.localization.calibration import CalibrationChoice
     from groma.localization.localizer import LocalizeOptions, Localizer
     from groma.localization.pose.absolute_pose import PoseOptions
@@ -99,6 +104,7 @@ def localize(
         )
     choice = CalibrationChoice(calibration, camera_model, camera_parameters(camera_params))
     files = query_files(queries)
+    of_queries = None if masks is None else Masks.of(masks, list(files))
     options = LocalizeOptions(lines=lines, min_segment_length=min_length, pose=PoseOptions(seed=seed))
     if console.threads is not None:  # each photograph has one of them
         one_opencv_thread()
@@ -107,7 +113,7 @@ def localize(
     work = _output.work_folder(output)
     with stages_that_are_kept(console, f"finished queries are kept in {work}") as say, work_with(console.threads):
         localizer = Localizer(map_, images, options=options, progress=say)
-        found = localize_images(localizer, files, work, choice, say)
+        found = localize_images(localizer, files, work, choice, say, of_queries)
     if localizer.warning:
         console.warn(localizer.warning)
     result = LocalizeResult(localizer.scene, localizer.index, tuple(found))

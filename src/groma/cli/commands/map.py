@@ -96,8 +96,9 @@ def map_(
     masks: Annotated[
         Path | None,
         _options.LANDMARKS.option(
-            "Masks of photographs, as for COLMAP (IMG_1.jpg.png, or IMG_1.png): nothing is found where they are black.",
-            metavar="FOLDER",
+            "Masks of photographs, a folder as for COLMAP (IMG_1.jpg.png, or IMG_1.png), or one image for all: nothing "
+            "is found where they are black.",
+            metavar="PATH",
         ),
     ] = None,
     line_matches: Annotated[

@@ -54,6 +54,13 @@ def track(
             "rgbd, stereo or mono. Default: recognised by the files.", choices=_complete.SEQUENCES, metavar="KIND"
         ),
     ] = None,
+    masks: Annotated[
+        Path | None,
+        _options.LANDMARKS.option(
+            "Masks of the (left) images, a folder as for groma map --masks, or one image for all: black is not used.",
+            metavar="PATH",
+        ),
+    ] = None,
     points: Annotated[bool, _options.LANDMARKS.option("Track points.")] = True,
     lines: Annotated[bool, _options.LANDMARKS.option("Track line segments.")] = True,
     line_detector: _options.LineDetector = "lsd",
@@ -105,7 +112,7 @@ def track(
 
     known = cast("Literal['rgbd', 'stereo', 'mono'] | None", kind)
     frames = open_sequence(
-        sequence, camera=camera, depth_scale=depth_scale, stride=stride, max_frames=max_frames, kind=known
+        sequence, camera=camera, depth_scale=depth_scale, stride=stride, max_frames=max_frames, kind=known, masks=masks
     )
     alone = console.threads == 1
     if alone or frames.camera.baseline is None:  # dense disparities of pairs pay for threads of their own

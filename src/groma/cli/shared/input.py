@@ -3,6 +3,7 @@
 
 from pathlib import Path
 
+from groma.bounded.names import existing
 from groma.errors import InputError
 
 
@@ -34,10 +35,5 @@ def camera_line(model: str | None, params: str | None) -> str | None:
 def check_inputs(*paths: Path | None) -> None:
     """Refuse paths that do not exist; None: not given."""
     for path in paths:
-        if path is None:
-            continue
-        try:
-            path.stat()
-        except (OSError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise InputError(f"Cannot read {path}: {reason}. Check the path.") from error
+        if path is not None:
+            existing(path)

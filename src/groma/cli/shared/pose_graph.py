@@ -49,6 +49,8 @@ def adjust_graph_and_write(
     rows = [[kind, f"{numbers[f'num_{kind}']:,}"] for kind in ("poses", "motions")]
     if len(result.outliers):
         rows.append(["beyond the scale of the loss", f"{len(result.outliers):,}"])
+    if numbers["noise"] is not None:
+        rows.append(["noise, times that of the file", f"{numbers['noise']:.3g}"])
     console.table(("", "number"), rows)
     time = spent(numbers["seconds"]["total"], compilation.seconds, compilation.compiled)
     costs = f"Cost {numbers['initial_cost']:.5g} -> {numbers['final_cost']:.5g}"

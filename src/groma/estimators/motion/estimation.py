@@ -23,7 +23,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.errors import InputError, check_kind
+from groma.errors import InputError, check_kind, given_or_default
 from groma.estimators.motion.degeneracy import what_is_common, why_open
 from groma.estimators.motion.groups import FREEDOM, Kind, changed_frame, moved, tangent_between
 from groma.estimators.motion.hypotheses import SAMPLE, propose
@@ -114,7 +114,7 @@ def estimate_motion(matches: LandmarkMatches, kind: Kind = "rigid", options: Mot
         message says which.
     """
     check_kind(matches, LandmarkMatches, "matches", "Put the lines and points into one, row by row.")
-    options = options or MotionOptions()
+    options = given_or_default(options, MotionOptions)
     if kind not in FREEDOM:
         raise InputError(f"kind must be one of {', '.join(FREEDOM)}; got {kind!r}.")
     if len(matches) < SAMPLE[kind]:

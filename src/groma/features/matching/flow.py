@@ -21,7 +21,7 @@ import numpy.typing as npt
 from groma._rows import numbered
 from groma._trees import kd_tree
 from groma._typing import FloatArray, IntArray
-from groma.errors import InputError, ShapeError
+from groma.errors import InputError, ShapeError, given_or_default
 from groma.features.images import GrayImage, to_gray
 from groma.features.matches import LineMatches, mutual_best
 from groma.features.segments import Segments
@@ -93,7 +93,7 @@ def match_by_flow(
     ShapeError
         If the images differ in size, or a flow does not have that size.
     """
-    options = options or FlowOptions()
+    options = given_or_default(options, FlowOptions)
     if options.step <= 0.0 or options.max_distance <= 0.0:
         raise InputError(f"step and max_distance must be positive; got {options.step} and {options.max_distance}.")
     one, two = _pair(image_1, image_2)

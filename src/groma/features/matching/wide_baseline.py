@@ -35,7 +35,7 @@ import numpy.typing as npt
 
 from groma._numba import inline_kernel, kernel, loop
 from groma._typing import FloatArray, IntArray
-from groma.errors import InputError, ShapeError
+from groma.errors import InputError, ShapeError, given_or_default
 from groma.features.matches import LineMatches, mutual_best
 from groma.features.matching.descriptor import Descriptors
 from groma.features.matching.nearby import NearbyPoints, nearby_points
@@ -264,7 +264,7 @@ def match_wide_baseline(
     of; they are matched by surroundings and points, inside the beam. The memory used is that of the candidates, which
     the beam and the descriptor bound; the time is that of one cheap test for each pair of segments.
     """
-    options = options or WideBaselineOptions()
+    options = given_or_default(options, WideBaselineOptions)
     pairs, features = candidates(
         segments_1, segments_2, descriptors_1, descriptors_2, point_matches, fundamental, options
     )

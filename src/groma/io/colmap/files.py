@@ -18,9 +18,8 @@ from typing import Literal
 
 import numpy as np
 
-from groma.bounded.names import IMAGES
+from groma.bounded.names import IMAGES, existing
 from groma.errors import FileFormatError
-from groma.io.reading import existing
 
 _FILES = ("cameras", "images", "points3D")
 _COUNT = struct.Struct("<Q")

@@ -2,8 +2,8 @@
 """Masks of photographs: a folder with one image for each, black where nothing is to be used.
 
 ``rooms/IMG_1.jpg`` has ``rooms/IMG_1.jpg.png``, as in COLMAP, ``rooms/IMG_1.png`` or ``rooms/IMG_1_mask.png``, of any
-kind of image; where the folder has no folders, ``IMG_1.jpg.png`` and so on. Masks of another resolution are read at the
-nearest pixel.
+kind of image; where the folder has no folders, ``IMG_1.jpg.png`` and so on. A file is the mask of all photographs: what
+the camera is mounted on is always at the same place. Masks of another resolution are read at the nearest pixel.
 """
 
 from __future__ import annotations
@@ -19,13 +19,18 @@ import numpy as np
 
 from groma._typing import BoolArray
 from groma.bounded.images import decoded
-from groma.bounded.names import IMAGES
+from groma.bounded.names import IMAGES, files_below, masks_among
 from groma.errors import FileFormatError, InputError
 from groma.io.depth_maps import at_size, has_proportions
 from groma.io.reading import reading
 
 #: Grey levels that are black: in JPEG files levels are inexact, so that white is what is nearer to it (derived).
 _BLACK, _BLACK_JPEG = 0, 127
+
+
+def _state_of(path: Path) -> tuple[int, int]:
+    stat = path.stat()
+    return stat.st_size, stat.st_mtime_ns
 
 
 @dataclass(frozen=True)
@@ -44,13 +49,14 @@ class Masks:
         InputError
             If the folder is none, or no photograph has a mask.
         """
+        if folder.is_file() and folder.suffix.lower() in IMAGES:
+            return cls(folder, tuple((name, folder, _state_of(folder)) for name in names))
         if not folder.is_dir():
-            raise InputError(f"{folder} is not a folder of masks ({', '.join(IMAGES)}). Check the path.")
-        known = {
-            path.relative_to(folder).with_suffix("").as_posix(): path
-            for path in sorted(folder.rglob("*"))
-            if path.suffix.lower() in IMAGES and path.is_file()
-        }
+            raise InputError(f"{folder} is not a folder of masks, nor a mask ({', '.join(IMAGES)}). Check the path.")
+        found = {path.relative_to(folder).as_posix(): path for path in files_below(folder)}
+        found = {name: path for name, path in found.items() if path.suffix.lower() in IMAGES}
+        beside = masks_among(found)  # then the others are photographs
+        known = {PurePosixPath(name).with_suffix("").as_posix(): found[name] for name in (beside or found)}
         places = [PurePosixPath(name) for name in names]
         if not any("/" in key for key in known) and len({place.stem for place in places}) == len(places):
             places = [PurePosixPath(place.name) for place in places]
@@ -59,8 +65,7 @@ class Masks:
             stem = place.with_suffix("").as_posix()
             path = next((known[key] for key in (place.as_posix(), stem, f"{stem}_mask") if key in known), None)
             if path is not None:
-                stat = path.stat()
-                files.append((name, path, (stat.st_size, stat.st_mtime_ns)))
+                files.append((name, path, _state_of(path)))
         if not files:
             example = next(iter(known.values()), None)
             there = f"it holds {example.name!r}" if example else "it holds no images"

@@ -23,13 +23,14 @@ from pathlib import Path
 import numpy as np
 
 from groma.bounded.content import read_content
+from groma.bounded.names import existing
 from groma.bounded.text import read_lines, shown
 from groma.errors import FileFormatError
 from groma.io.interchange.calibration import Calibration
 from groma.io.interchange.centred import centred_scene, point_rows
 from groma.io.interchange.poses import file_in, rigid, size_of_image
 from groma.io.pose_conventions import BUNDLER
-from groma.io.reading import existing, reading
+from groma.io.reading import reading
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Scene
 

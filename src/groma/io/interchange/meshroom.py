@@ -32,12 +32,13 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.bounded.documents import member, names_early, of_kind, read_document, size, table
+from groma.bounded.names import existing
 from groma.bounded.text import finite, shown
 from groma.errors import FileFormatError
 from groma.io.interchange.calibration import Calibration, camera_table, fisheye, polynomial
 from groma.io.interchange.poses import points_table, rigid
 from groma.io.pose_conventions import MESHROOM
-from groma.io.reading import existing, reading
+from groma.io.reading import reading
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import PointObservations, Scene
 

@@ -30,12 +30,13 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.bounded.content import read_content
 from groma.bounded.documents import size
+from groma.bounded.names import existing
 from groma.bounded.text import finite, shown
 from groma.errors import FileFormatError
 from groma.io.interchange.calibration import Calibration, camera_table, fisheye, panorama, polynomial
 from groma.io.interchange.poses import rigid
 from groma.io.pose_conventions import METASHAPE
-from groma.io.reading import existing, reading, warn_of_the_others
+from groma.io.reading import reading, warn_of_the_others
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Scene
 

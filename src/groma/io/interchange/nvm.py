@@ -26,13 +26,14 @@ from pathlib import Path
 import numpy as np
 
 from groma._typing import FloatArray
+from groma.bounded.names import existing
 from groma.bounded.text import finite, read_text, shown, whole
 from groma.errors import FileFormatError
 from groma.io.interchange.calibration import Calibration, inverse_polynomial
 from groma.io.interchange.centred import PointRows, centred_scene, point_rows
 from groma.io.interchange.poses import rigid, size_of_image
 from groma.io.pose_conventions import NVM, NVM_MATRIX
-from groma.io.reading import existing, reading, warn_of_the_others
+from groma.io.reading import reading, warn_of_the_others
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Scene
 

@@ -36,12 +36,13 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.bounded.documents import begins_with, member, number, of_kind, read_document, size, table
+from groma.bounded.names import existing
 from groma.bounded.text import shown
 from groma.errors import FileFormatError
 from groma.io.interchange.calibration import Calibration, camera_table, fisheye, panorama, polynomial
 from groma.io.interchange.poses import file_in, points_table, rigid
 from groma.io.pose_conventions import OPENMVG
-from groma.io.reading import existing, reading
+from groma.io.reading import reading
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import PointObservations, Scene
 

@@ -35,12 +35,13 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.bounded.documents import member, names_early, number, of_kind, read_document, size, table
+from groma.bounded.names import existing
 from groma.bounded.text import finite, read_text, shown
 from groma.errors import FileFormatError
 from groma.io.interchange.calibration import Calibration, camera_table, fisheye, panorama, polynomial
 from groma.io.interchange.poses import file_in, points_table
 from groma.io.pose_conventions import OPENSFM
-from groma.io.reading import existing, reading, warn_of_the_others
+from groma.io.reading import reading, warn_of_the_others
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import PointObservations, Scene
 

@@ -42,7 +42,7 @@ import numpy as np
 
 from groma import cameras as camera_models
 from groma.bounded.documents import member, names_early, number, of_kind, read_document, size, table
-from groma.bounded.names import IMAGES, listed_file
+from groma.bounded.names import IMAGES, existing, listed_file
 from groma.bounded.text import shown
 from groma.errors import FileFormatError, InputError
 from groma.geometry import quaternion
@@ -52,7 +52,7 @@ from groma.io.interchange.poses import file_in, points_table, rigid, size_of_ima
 from groma.io.ply import write_ply
 from groma.io.ply_tables import read_ply_points
 from groma.io.pose_conventions import FLIP, TRANSFORMS
-from groma.io.reading import existing, reading
+from groma.io.reading import reading
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Cameras, Points, Scene
 from groma.scene.checks import check_scene_given

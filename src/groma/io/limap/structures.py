@@ -42,6 +42,7 @@ from pathlib import Path
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.bounded.names import existing
 from groma.errors import FileFormatError, InputError
 from groma.io.archive import archive_in, read_archive, write_archive
 from groma.io.atomic import atomic_output
@@ -61,7 +62,7 @@ from groma.io.limap.files import (
 from groma.io.limap.from_scene import RowsById, from_scene, group_ids, int_ids
 from groma.io.limap.read import read_files
 from groma.io.limap.write import write_files
-from groma.io.reading import existing, reading
+from groma.io.reading import reading
 from groma.scene import Directions, LineObservations, Lines, Planes, Relations, Scene
 from groma.scene.line_intervals import one_line_per_interval
 

@@ -5,14 +5,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from groma._counted import first_of
-from groma.bounded.names import VIDEOS
+from groma.bounded.names import VIDEOS, existing
 from groma.errors import InputError
-from groma.io.reading import existing
+from groma.io.colmap.masks import Masks
 from groma.io.sequences._calibration import Calibration, CameraLike, calibration_of
-from groma.io.sequences._reader import Selection
+from groma.io.sequences._reader import FileSequence, Selection
 from groma.io.sequences.euroc import euroc_root, open_euroc
 from groma.io.sequences.frame import Frame, Kind, Sequence, SequenceCamera
 from groma.io.sequences.images import image_files, open_images, open_video
@@ -31,6 +32,7 @@ def open_sequence(
     stride: int = 1,
     max_frames: int | None = None,
     kind: Kind | None = None,
+    masks: str | os.PathLike[str] | None = None,
 ) -> Sequence:
     """Open an image sequence; its layout is recognised from the folder. Frames are read on demand.
 
@@ -53,6 +55,8 @@ def open_sequence(
         Maximum number of frames.
     kind : str, optional
         ``mono`` leaves depth or right images out; other kinds must be what the files hold.
+    masks : path, optional
+        Folder of masks of the (left) images by their names, or one image for all: what is black is not used.
 
     Returns
     -------
@@ -76,7 +80,8 @@ def open_sequence(
     wishes = Wishes(calibration, depth_scale, selection)
     for layout in layouts():
         if (root := layout.find(place)) is not None:
-            return layout.open(root, wishes)
+            sequence = layout.open(root, wishes)
+            return sequence if masks is None else _masked(sequence, existing(masks))
     if not place.is_dir():
         raise InputError(f"{place} is neither a folder nor a video ({', '.join(VIDEOS)}). Pass the sequence's folder.")
     readable = (one for one in sorted(place.iterdir()) if os.access(one, os.R_OK))
@@ -84,6 +89,12 @@ def open_sequence(
     hint = f"It contains sequences: {first_of(inner, 3)}." if inner else "Check the path."
     signs = ", ".join(layout.sign for layout in layouts() if layout.sign)
     raise InputError(f"{place} is no sequence that groma knows: expected {signs}, or images. {hint}")
+
+
+def _masked(sequence: Sequence, masks: Path) -> Sequence:
+    if not isinstance(sequence, FileSequence):
+        raise InputError("Masks are for sequences of image files, and this is another one. Take pictures out of it.")
+    return replace(sequence, masks=Masks.of(masks, [entry.gray.name for entry in sequence.entries]))
 
 
 def _here(has_layout: Callable[[Path], object]) -> Callable[[Path], Path | None]:

@@ -19,8 +19,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from groma._typing import BoolArray
 from groma.bounded.images import decoded
 from groma.errors import FileFormatError, InputError
+from groma.io.colmap.masks import Masks
 from groma.io.depth_maps import at_size, has_proportions
 from groma.io.sequences._calibration import Calibration, Rectification, rectification
 from groma.io.sequences.frame import Frame, Kind, SequenceCamera
@@ -108,6 +110,8 @@ class FileSequence:
     file_size: tuple[int, int]
     reference: Trajectory | None
     warnings: list[str]
+    #: What may be used of the images in the files; None: all.
+    masks: Masks | None = None
     num_frames: int | None = field(init=False)
     #: The brightest level of images of 16 bits.
     full_level: int = field(init=False)
@@ -148,7 +152,13 @@ class FileSequence:
             right = _image(entry.right, shape, self.full_level, remarks, "the frame comes without")
             if right is not None and preparation.right is not None:
                 right = preparation.right.gray(right)
-        return Frame(entry.timestamp, gray, depth, right, entry.gray.name), remarks
+        return Frame(entry.timestamp, gray, depth, right, entry.gray.name, self._used(entry.gray.name)), remarks
+
+    def _used(self, name: str) -> BoolArray | None:
+        used = None if self.masks is None else self.masks.read(name, self.file_size)
+        if used is None or self.preparation.gray is None:
+            return used
+        return np.asarray(self.preparation.gray.gray(used.astype(np.uint8) * 255) == 255, np.bool_)
 
     def _depth(self, path: Path | None, name: str, remarks: list[str]) -> npt.NDArray[np.float32] | None:
         if path is None:

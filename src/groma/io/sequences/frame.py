@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groma import cameras
-from groma._typing import FloatArray
+from groma._typing import BoolArray, FloatArray
 from groma.errors import GromaError, InputError
 from groma.io.trajectories import Trajectory
 
@@ -33,6 +33,8 @@ class Frame:
     right: npt.NDArray[np.uint8] | None = None
     #: Name of the image file, or the number of the frame.
     name: str = ""
+    #: (H, W) bool, which pixels may be used; None: all.
+    used: BoolArray | None = None
 
 
 @dataclass(frozen=True, eq=False)

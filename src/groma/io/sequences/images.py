@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._counted import natural_key
-from groma.bounded.names import IMAGES
+from groma.bounded.names import IMAGES, masks_among
 from groma.bounded.text import finite, read_words
 from groma.errors import FileFormatError, InputError
 from groma.io.reading import reading
@@ -41,8 +41,8 @@ def images_in(folder: Path) -> list[Path]:
     """Return the images of a folder itself in order of the numbers in their names; none where it is not there."""
     if not folder.is_dir():
         return []
-    found = (path for path in folder.iterdir() if path.suffix.lower() in IMAGES and path.is_file())
-    return sorted(found, key=lambda path: natural_key(path.name))
+    found = {path.name for path in folder.iterdir() if path.suffix.lower() in IMAGES and path.is_file()}
+    return [folder / name for name in sorted(found - masks_among(found), key=natural_key)]
 
 
 def camera_for(place: Path, wishes: Wishes, *folders: Path) -> Calibration:

@@ -23,9 +23,10 @@ import numpy as np
 from groma._counted import first_of
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.bounded.documents import begins_with, member, number, of_kind, read_document, table
+from groma.bounded.names import existing
 from groma.bounded.text import finite, read_lines, shown
 from groma.errors import FileFormatError
-from groma.io.reading import existing, reading
+from groma.io.reading import reading
 from groma.io.survey.coordinates import CoordinateSystem, Places
 from groma.io.survey.positions import split
 

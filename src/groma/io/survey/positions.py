@@ -25,9 +25,10 @@ from pathlib import Path
 import numpy as np
 
 from groma._counted import counted
+from groma.bounded.names import existing
 from groma.bounded.text import finite, read_lines, read_text, shown
 from groma.errors import FileFormatError
-from groma.io.reading import existing, reading
+from groma.io.reading import reading
 from groma.io.survey.coordinates import CoordinateSystem, Places
 
 _KIND = "file of positions"

@@ -26,9 +26,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import FloatArray
+from groma.bounded.names import existing
 from groma.bounded.text import finite, is_number, read_lines, shown
 from groma.errors import FileFormatError
-from groma.io.reading import existing, reading
+from groma.io.reading import reading
 from groma.io.survey.positions import split
 
 _NAN = float("nan")

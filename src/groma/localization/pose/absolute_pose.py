@@ -14,8 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._typing import BoolArray, FloatArray
+from groma.errors import check_kind, given_or_default
 from groma.geometry import quaternion
-from groma.localization.pose.camera import QueryCamera
+from groma.geometry.algebra import as_rows, numbers
+from groma.localization.pose.camera import CAMERA_WAY, QueryCamera
 from groma.localization.pose.free_lens import FreeLens, free_lens
 from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import max_errors, propose, straightened
@@ -40,6 +42,7 @@ from groma.localization.pose.verdict import (
     votes_of_a_part,
     votes_of_a_rival,
 )
+from groma.scene.survey import check_covariance
 
 
 @dataclass(frozen=True)
@@ -194,18 +197,22 @@ def estimate_absolute_pose(
     -------
     AbsolutePose
         If no pose is found, its status is ``failed`` and its sentence says why.
+
+    Raises
+    ------
+    InputError
+        If an argument is no numbers, or of another shape; a number is not finite, or no covariance.
     """
-    points, segments = np.asarray(_or_none(points2d, 2)), np.asarray(_or_none(segments2d, 2, 2))
+    check_kind(camera, QueryCamera, "camera", CAMERA_WAY)
+    check_kind(covariances, (tuple, list), "covariances", "Pass (of points, of lines), None where they are exact.")
+    of_points, of_segments = as_rows([sigma], (2,), "[sigma]")[0]
+    points, segments = _rows("points2d", points2d, 2), _rows("segments2d", segments2d, 2, 2)
     of = ((points, 3, covariances[0]), (segments, 6, covariances[1]))
-    matches = Matches(
-        points,
-        np.asarray(_or_none(points3d, 3)),
-        segments,
-        np.asarray(_or_none(segments3d, 2, 3)),
-        np.full(len(points), float(sigma[0])),
-        np.full(len(segments), float(sigma[1])),
-        *(np.zeros((len(rows), size, size)) if given is None else np.asarray(given, float) for rows, size, given in of),
-    )
+    known = [np.zeros((len(rows), n, n)) if one is None else numbers(one, "covariances") for rows, n, one in of]
+    rows = points, _rows("points3d", points3d, 3), segments, _rows("segments3d", segments3d, 2, 3)
+    matches = Matches(*rows, np.full(len(points), of_points), np.full(len(segments), of_segments), *known)
+    check_covariance("covariances of points", matches.point_covariance, exact=True)
+    check_covariance("covariances of lines", matches.line_covariance, exact=True)
     return pose_from_matches(camera, matches, options)
 
 
@@ -230,7 +237,7 @@ def pose_from_matches(
     of_map : MapQuestions
         What is asked of the map.
     """
-    options, guided, expected = options or PoseOptions(), of_map.guided, of_map.expected
+    options, guided, expected = given_or_default(options, PoseOptions), of_map.guided, of_map.expected
     if most_votes(matches, camera) < enough:
         return _failed(camera, matches)
     best = _best(camera, matches, options)
@@ -389,5 +396,5 @@ def _failed(camera: QueryCamera, matches: Matches) -> AbsolutePose:
     return AbsolutePose("failed", why, 0.0, None, None, *none, camera, matches)
 
 
-def _or_none(value: npt.ArrayLike | None, *shape: int) -> npt.ArrayLike:
-    return np.zeros((0, *shape)) if value is None else value
+def _rows(name: str, value: npt.ArrayLike | None, *shape: int) -> FloatArray:
+    return np.zeros((0, *shape)) if value is None else np.atleast_1d(numbers(value, name))

@@ -15,6 +15,9 @@ from groma.errors import InputError
 from groma.geometry.charts.pose_charts import POSE_CHARTS
 from groma.scene import Cameras
 
+#: How to get one.
+CAMERA_WAY = "Make one: groma.QueryCamera(model, params, width, height)."
+
 
 @dataclass(frozen=True, eq=False)
 class QueryCamera:

@@ -25,7 +25,7 @@ from functools import partial
 import numpy as np
 
 from groma._typing import IntArray
-from groma.errors import InputError
+from groma.errors import InputError, given_or_default
 from groma.execution import work_with
 from groma.features.matches import LineMatches
 from groma.features.segments import Segments
@@ -44,6 +44,7 @@ from groma.mapping.lines.neighbors import covisible_neighbors
 from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.views import build_views
 from groma.scene import Scene
+from groma.scene.checks import check_scene_given
 
 
 def map_lines(
@@ -92,7 +93,8 @@ def map_lines(
     -----
     Time and memory grow with images x neighbours x segments; proposals are kept for one image only.
     """
-    options = options or MapLinesOptions()
+    options = given_or_default(options, MapLinesOptions)
+    check_scene_given(scene)
     if len(segments) != scene.num_images:
         raise InputError(
             f"segments must hold one set per image of the scene ({scene.num_images}); got {len(segments)}. "

@@ -13,6 +13,7 @@ from dataclasses import replace
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult, Progress
 from groma.adjustment.rolling_shutter import GATES as SETTLING
+from groma.errors import given_or_default
 from groma.mapping.noise.observations import noise_px
 from groma.scene import Scene
 
@@ -35,7 +36,7 @@ def adjust_weighted(
     As :func:`groma.adjust`, but ``point_sigma_px`` and ``line_sigma_px`` are estimated: before, and where residuals
     shrink much, once more.
     """
-    chosen = weighted(scene, options or AdjustOptions())
+    chosen = weighted(scene, given_or_default(options, AdjustOptions))
     result = adjust(scene, chosen, progress)
     for _ in range(SETTLING.max_rounds - 1):
         better = weighted(result.scene, chosen)

@@ -25,7 +25,7 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assembly_options import SURFACE_SIGMA_PX
 from groma.adjustment.terms.relations import ANGLES, lengths_per_pixel
-from groma.errors import InputError
+from groma.errors import InputError, given_or_default
 from groma.estimators.directions import DirectionOptions, DirectionSet, directions_from_lines
 from groma.estimators.plane_search import PlaneOptions, PlaneSet, find_planes
 from groma.execution import begin, together
@@ -38,6 +38,7 @@ from groma.mapping.structure.junctions import meetings
 from groma.mapping.structure.relations import Landmarks, Pairs, on_lines, spacings
 from groma.mapping.structure.rough_planes import on_fitted_planes
 from groma.scene import Directions, Held, Planes, Relations, Scene
+from groma.scene.checks import check_scene_given
 from groma.scene.survey import Kind
 from groma.scene.table import new_index_of
 
@@ -145,7 +146,8 @@ def detect_structure(
 
     Parameters and exceptions are those of :func:`find_structure`.
     """
-    options = options or StructureOptions()
+    options = given_or_default(options, StructureOptions)
+    check_scene_given(scene)
     _check(options)
     scene = scene.keep(planes=[], directions=[])
     report = progress or (lambda stage, done, total: None)

@@ -15,13 +15,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.features.depth.noise import DepthNoise
 from groma.features.depth.points import DEPTH_POINTS, depth_at
 from groma.features.images import GrayImage, SmoothImage, smoothed
 from groma.features.point_tracks import corners
 from groma.features.segments import Segments
 from groma.io.sequences.frame import Frame
+from groma.mapping.image_segments import is_used, segments_used
 from groma.tracking.frame.camera import TrackCamera, back
 from groma.tracking.frame.coarse_alignment import SmallImage, small_image
 from groma.tracking.frame.depth import DepthImage, depth_sigma, segment_inverse_depths
@@ -122,12 +123,14 @@ class FrameFeatures:
     @_FoundOnce
     def features(self) -> Features:
         """ORB features over several scales."""
-        return describe(self.gray, self.options.num_features, self.depths, self.options.gates.features)
+        return describe(self.gray, self.options.num_features, self.depths, self.options.gates.features, self.frame.used)
 
     @_FoundOnce
     def detected(self) -> DetectedSegments:
         """Segments by the chosen detector."""
         segments = self.options.make_detector().detect(self.gray)
+        if self.frame.used is not None:
+            segments = segments_used(segments, self.frame.used)
         inverse, sigma = self.inverse_depths(segments.ends)
         return DetectedSegments(segments, inverse, sigma)
 
@@ -140,7 +143,8 @@ class FrameFeatures:
     def corners(self) -> FloatArray:
         """Corners (N, 2) for tracking, strongest first."""
         distance = self.options.gates.points.corner_distance * self.corner_cell
-        return corners(self.gray, self.options.num_points, distance)
+        found = corners(self.gray, self.options.num_points, distance)
+        return found if self.frame.used is None else found[is_used(self.frame.used, found)]
 
     def lock_of(self, name: str) -> Any:
         """Return the lock of one property."""
@@ -199,7 +203,12 @@ class FrameFeatures:
         """The depth image; small holes are filled where most of it is missing."""
         if self.frame.depth is None:
             return None
-        return fill_sparse(self.frame.depth, self.options.max_depth, self.options.gates)
+        depth = (
+            self.frame.depth
+            if self.frame.used is None
+            else np.where(self.frame.used, self.frame.depth, np.float32(0.0))
+        )
+        return fill_sparse(depth, self.options.max_depth, self.options.gates)
 
     def depths(self, pixels: FloatArray) -> FloatArray:
         """Depths (N,) at pixels from the depth image or the right image; NaN where unknown."""
@@ -339,10 +348,12 @@ def describe(
     count: int,
     depths: Callable[[FloatArray], FloatArray],
     gates: FeatureGates = DEFAULT.features,
+    used: BoolArray | None = None,
 ) -> Features:
     """Find and describe ORB features, in all parts of the image rather than where contrast is strongest."""
     finder = cv2.ORB.create(nfeatures=gates.candidates * count, fastThreshold=gates.fast_threshold)
-    keypoints = finder.detect(gray, None)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    mask = None if used is None else used.astype(np.uint8)
+    keypoints = finder.detect(gray, mask)  # pyright: ignore[reportCallIssue, reportArgumentType]
     response = np.array([keypoint.response for keypoint in keypoints])
     octave = np.array([keypoint.octave for keypoint in keypoints], np.int64)
     pixel = np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64).reshape(-1, 2)

@@ -11,8 +11,9 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.bounded.arrays import Header, opened_arrays
+from groma.bounded.names import existing
 from groma.errors import FileFormatError, InputError
-from groma.io.reading import existing, reading
+from groma.io.reading import reading
 from groma.scene import Scene
 
 
