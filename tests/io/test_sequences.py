@@ -76,6 +76,12 @@ def test_intrinsics_of_the_benchmark(tum, tmp_path):
     np.testing.assert_allclose(sequence.camera.params, [535.4, 539.2, 320.6, 248.1])
     named.rename(tmp_path / "freiburg1_xyz")
     np.testing.assert_allclose(open_sequence(tmp_path / "freiburg1_xyz").camera.params, [517.3, 516.5, 319.1, 255.8])
+    (tmp_path / "freiburg1_xyz").rename(tmp_path / "data")
+    with pytest.raises(InputError, match="neither its name nor the first lines of its files say"):
+        open_sequence(tmp_path / "data")
+    said = "# color images\n# file: 'rgbd_dataset_freiburg2_desk.bag'\n"
+    (tmp_path / "data" / "rgb.txt").write_text(said + (tmp_path / "data" / "rgb.txt").read_text())
+    np.testing.assert_allclose(open_sequence(tmp_path / "data").camera.params[:2], [520.9, 521.0])
 
 
 def test_faults(tum):

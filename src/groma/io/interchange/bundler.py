@@ -85,8 +85,8 @@ def read_bundler(path: str | os.PathLike[str]) -> Scene:
         scene = centred_scene(names, calibrations, poses, posed, rows, place)
     if names and _list(place) is None:
         warnings.warn(
-            f"{place} has no list of its images beside it (list.txt, one name a line): they are named by their numbers, "
-            f"{names[0]} and so on.",
+            f"{place} has no list of its images beside it (list.txt, one name a line): they are named by their "
+            f"numbers, {names[0]} and so on.",
             stacklevel=2,
         )
     return scene
