@@ -66,6 +66,7 @@ def test_a_model_without_image_sizes_is_said(here, capsys):
     """Bundler's files have none; with the photographs beside them they are known."""
     lens, pose = "500 0 0\n", "1 0 0\n0 1 0\n0 0 1\n0 0 0\n"
     Path("bundle.out").write_text("# Bundle file v0.3\n2 0\n" + 2 * (lens + pose))
+    Path("list.txt").write_text("a.jpg\nb.jpg\n")
     assert run(["convert", "bundle.out", "sized.npz"]) == 0
     assert capsys.readouterr().err == ""
     assert run(["convert", "bundle.out", "model"]) == 0

@@ -44,7 +44,8 @@ def true():
 
 def test_without_photographs_pixels_count_from_the_centre(true, tmp_path):
     (tmp_path / "bundle.out").write_text(bundle(true))
-    scene = read_scene(tmp_path / "bundle.out")
+    with pytest.warns(UserWarning, match=r"no list of its images beside it \(list.txt, .*00000000.jpg and"):
+        scene = read_scene(tmp_path / "bundle.out")
     assert errors(scene).max() < 1e-9
     check_poses(scene, true)
     assert set(scene.cameras.models) == {"BAL"} and scene.cameras.width.max() == 0

@@ -83,6 +83,10 @@ def test_maps_have_the_names_of_photographs(folder):
         maps.files(["a.jpg"])
     with pytest.raises(InputError, match=r"none of the 1 photographs; it holds .*, the first photograph is 'x.jpg'"):
         maps.files(["x.jpg"])
+    (folder / "exr").mkdir()
+    (folder / "exr" / "x.exr").touch()
+    with pytest.raises(InputError, match=r"a kind that is not read, for example 'x.exr'. Save them as 16-bit PNG"):
+        DepthMaps(folder / "exr").files(["x.jpg"])
     with pytest.raises(InputError, match="not a folder of depth maps"):
         DepthMaps(folder / "a.png").files(["a.jpg"])
 

@@ -281,5 +281,7 @@ def test_landmarks_that_do_not_hold_leave_their_plane(stereo):
 
 
 def test_sentences():
-    assert "did not hold" in PlaneOutcome((10, 2), 1, 0, dropped=8).sentence
-    assert "1 landmark contradicted" in PlaneOutcome((10, 2), 1, 1, 9, 2, 1).sentence
+    assert "did not hold" in PlaneOutcome((10, 2), 0, 1, 0, dropped=8).sentence
+    told = PlaneOutcome((10, 2), 4, 1, 1, 9, 2, 1).sentence
+    assert "1 landmark contradicted" in told
+    assert "10 points (4 of them in one keyframe alone, which are not written) and 2 lines" in told

@@ -8,11 +8,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from _pages import data_of, write_page
+from _pages import data_of, write_on_its_side, write_page
 from _scene import exact_scene
 
 from groma.cli.main import run
 from groma.errors import InputError, OutputError
+from groma.geometry import se3
 from groma.io import write_scene
 from groma.scene import Directions, Planes, Relations, Scene
 from groma.scene.synthetic.scenes import holistic
@@ -131,6 +132,18 @@ def test_images_are_embedded(tmp_path):
     assert entries[1]["photo"] == ""
 
 
+def test_photographs_taken_on_their_side_are_shown_upright(tmp_path):
+    """What is up in the scene follows: the left of the photographs, as they are stored."""
+    scene = exact_scene()
+    for name in scene.images.names:
+        write_on_its_side(tmp_path / name, np.full((480, 640, 3), 128, np.uint8))
+    data = data_of(write_page(tmp_path, None, scene, images=tmp_path))
+    assert [entry["turn"] for entry in data["images"]] == [1, 1]
+    left = -se3.to_matrix(scene.cam_from_world)[:, 0, :3].sum(axis=0)
+    np.testing.assert_allclose(data["view"]["up"], left / np.linalg.norm(left), atol=1e-12)
+    assert [entry["turn"] for entry in data_of(write_page(tmp_path, None, scene))["images"]] == [0, 0]
+
+
 def test_segments_in_the_images(tmp_path):
     """What is drawn in a photograph: measured ends, ways to the image of the line, images of the 3D segments."""
     scene = exact_scene()
@@ -220,7 +233,7 @@ def test_photographs_keep_to_their_budget(tmp_path):
     noise = np.random.default_rng(0).integers(0, 255, (900, 1200, 3), np.uint8)
     cv2.imwrite(str(tmp_path / "first.jpg"), noise)
     cv2.imwrite(str(tmp_path / "second.jpg"), noise)
-    photos = _page_images._photographs(["first.jpg", "missing.jpg", "second.jpg"], tmp_path)()
+    photos = _page_images._photographs(["first.jpg", "missing.jpg", "second.jpg"], tmp_path).addresses()
     assert photos[1] == "" and all(photo.startswith("data:image/jpeg;base64,") for photo in photos[::2])
     assert all(len(jpeg_address(noise, budget)) <= 1.1 * budget for budget in (30_000, 100_000, 10_000_000))
 

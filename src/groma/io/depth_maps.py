@@ -81,6 +81,13 @@ class DepthMaps:
         if twice is not None:
             raise InputError(f"A photograph has two depth maps, {twice[0]} and {twice[1].name}. Remove one of them.")
         if not any(found):
+            wanted = {stem.name for stem in stems}
+            unread = [path.name for path in self.folder.rglob("*") if path.stem in wanted]
+            if unread and not maps:
+                raise InputError(
+                    f"{self.folder} holds maps of a kind that is not read, for example {min(unread)!r}. Save them as "
+                    "16-bit PNG, .npy or .npz."
+                )
             example = next((paths[0].name for paths in maps.values()), None)
             there = f"it holds {example!r}" if example else f"it holds no {', '.join(ENDINGS)}"
             raise InputError(

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from groma._typing import FloatArray
+from groma._typing import FloatArray, IntArray
 from groma.geometry import quaternion
 from groma.scene.scene import Scene
 from groma.scene.similarity import Similarity
@@ -66,15 +66,21 @@ def _middle_and_extent(scene: Scene) -> tuple[FloatArray, float]:
     return middle, float(np.median(np.linalg.norm(places - middle, axis=1)))
 
 
-def up_of(scene: Scene) -> FloatArray:
+def up_of(scene: Scene, turns: IntArray | None = None) -> FloatArray:
     """Return the direction (3,) that is up: z, where heights or gravity were measured, else :func:`upward`.
 
-    Photographs taken from above have their tops to the north, not up.
+    Photographs taken from above have their tops to the north, not up. Those of a camera that was held on its side are
+    upright after quarter turns to the right, ``turns`` (N,).
     """
     has_heights = len(scene.camera_positions) + int(scene.control_points.is_control.sum()) > 1
     if has_heights or len(scene.known_directions):
         return np.array([0.0, 0.0, 1.0])
-    return upward(quaternion.to_matrix(scene.cam_from_world[:, :4]))
+    axes = quaternion.to_matrix(scene.cam_from_world[:, :4])
+    if turns is not None:
+        cosine, sine = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])[turns].T[:, :, None]
+        x, y, z = axes.swapaxes(0, 1)
+        axes = np.stack([cosine * x - sine * y, sine * x + cosine * y, z], axis=1)
+    return upward(axes)
 
 
 def upward(axes: FloatArray) -> FloatArray:

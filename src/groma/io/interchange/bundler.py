@@ -18,6 +18,7 @@ Reference: N. Snavely, *Bundler v0.4 User's Manual*, 2008.
 from __future__ import annotations
 
 import os
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -35,13 +36,15 @@ from groma.io.registry import SceneFormat, register_format
 from groma.scene import Scene
 
 _NAME = "bundle.out"
+#: The list of RunBundler.sh; its names begin one folder up, like the bundle file's.
+_PREPARED = "prepare/list.txt"
 _FIRST_LINE = b"# Bundle file v0.3"
 #: Numbers of a camera (file format).
 _CAMERA = 15
 
 
 def read_bundler(path: str | os.PathLike[str]) -> Scene:
-    """Read a bundle file; images are named by ``list.txt`` beside it, else by their numbers.
+    """Read a bundle file; images are named by ``list.txt`` beside it, else, with a warning, by their numbers.
 
     Parameters
     ----------
@@ -80,7 +83,14 @@ def read_bundler(path: str | os.PathLike[str]) -> Scene:
             for row, lens in zip(posed.tolist(), used[:, :3].tolist(), strict=True)
         ]
         rows.pixel[:, 1] *= -1.0
-        return centred_scene(names, calibrations, poses, posed, rows, place)
+        scene = centred_scene(names, calibrations, poses, posed, rows, place)
+    if names and _list(place) is None:
+        warnings.warn(
+            f"{place} has no list of its images beside it (list.txt, one name a line): they are named by their "
+            f"numbers, {names[0]} and so on.",
+            stacklevel=2,
+        )
+    return scene
 
 
 def _counts(body: bytes, path: Path) -> tuple[int, int]:
@@ -93,18 +103,23 @@ def _counts(body: bytes, path: Path) -> tuple[int, int]:
     return cameras, points
 
 
-def _names(path: Path, count: int) -> tuple[Path, list[str]]:
-    """Return the folder of the images, and their names: the first word of each line of the list."""
+def _list(path: Path) -> Path | None:
+    """Return the list of the images of a bundle file, if there is one."""
     beside = [path.with_name("list.txt"), path.with_suffix(".list.txt"), path.with_suffix(".txt")]
     above = path.absolute().parent.parent
-    prepared = above / "prepare" / "list.txt"  # of RunBundler.sh; its names begin one folder up, too
-    found = next((place for place in [*beside, above / "list.txt", prepared] if place.is_file()), None)
+    return next((place for place in [*beside, above / "list.txt", above / _PREPARED] if place.is_file()), None)
+
+
+def _names(path: Path, count: int) -> tuple[Path, list[str]]:
+    """Return the folder of the images, and their names: the first word of each line of the list."""
+    found = _list(path)
     if found is None:
         return path.parent, [f"{row:08d}.jpg" for row in range(count)]
     names = [line.split()[0] for _, line in read_lines(found)]
     if len(names) != count:
         raise FileFormatError(f"{found} should name {count} images, one a line, as {path.name} has; got {len(names)}.")
-    return above if found == prepared else found.parent, [os.path.normpath(name).replace(os.sep, "/") for name in names]
+    folder = found.parents[1] if found == path.absolute().parents[1] / _PREPARED else found.parent
+    return folder, [os.path.normpath(name).replace(os.sep, "/") for name in names]
 
 
 def _calibration(lens: tuple[float, float, float], size: tuple[int, int]) -> Calibration:

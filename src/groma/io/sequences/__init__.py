@@ -19,6 +19,7 @@ from groma.io.sequences.frame import Frame, Kind, Sequence, SequenceCamera
 from groma.io.sequences.images import image_files, open_images, open_video
 from groma.io.sequences.kitti import is_kitti, open_kitti
 from groma.io.sequences.layouts import SequenceLayout, Wishes, layouts, register_layout
+from groma.io.sequences.left_right import is_left_right, open_left_right
 from groma.io.sequences.seven_scenes import open_seven_scenes, seven_scenes_root
 from groma.io.sequences.tum_rgbd import is_tum_rgbd, open_tum_rgbd
 from groma.io.sequences.two_folders import is_two_folders, open_two_folders
@@ -110,6 +111,7 @@ for _layout in (
     SequenceLayout("tum_rgbd", "rgb.txt or associations.txt (TUM)", _here(is_tum_rgbd), open_tum_rgbd),
     SequenceLayout("euroc", "mav0/cam0 (EuRoC)", euroc_root, open_euroc),
     SequenceLayout("kitti", "image_0 (KITTI)", _here(is_kitti), open_kitti),
+    SequenceLayout("left_right", "left and right (stereo pairs)", _here(is_left_right), open_left_right),
     SequenceLayout("seven_scenes", "frame-000000.color.png (7-Scenes)", seven_scenes_root, open_seven_scenes),
     SequenceLayout("two_folders", "rgb or color with depth", _here(is_two_folders), open_two_folders),
     SequenceLayout("images", "", _here(image_files), open_images),

@@ -35,13 +35,11 @@ def open_kitti(folder: Path, wishes: Wishes) -> FileSequence:
     calibration = wishes.calibration
     left, right = ("image_0", "image_1") if (folder / "image_0").is_dir() else ("image_2", "image_3")
     has_right = (folder / right).is_dir()
-    matrices = _matrices(folder / "calib.txt") if (folder / "calib.txt").is_file() else {}
+    matrices = projections(folder / "calib.txt") if (folder / "calib.txt").is_file() else {}
     projection, other = (matrices.get(f"P{name[-1]}") for name in (left, right))
     if projection is None and calibration is None:
         raise FileFormatError(f"{folder / 'calib.txt'} is missing or holds no P{left[-1]}. Add it, or pass camera=.")
-    baseline = None
-    if projection is not None and other is not None:
-        baseline = float(projection[0, 3] / projection[0, 0] - other[0, 3] / other[0, 0])
+    baseline = baseline_of(projection, other)
     warnings: list[str] = []
     if has_right and not (baseline is not None and baseline > 0):
         warnings.append(f"calib.txt says no baseline from {left} to {right}; only {left} is used.")
@@ -67,8 +65,8 @@ def open_kitti(folder: Path, wishes: Wishes) -> FileSequence:
     )
 
 
-def _matrices(path: Path) -> dict[str, FloatArray]:
-    """Return the 3x4 matrices P0 to P3."""
+def projections(path: Path) -> dict[str, FloatArray]:
+    """Return the 3x4 matrices P0 to P3 of a ``calib.txt``."""
     with reading(path, "KITTI calibration"):
         found = {}
         for number, line in read_lines(path):
@@ -79,6 +77,11 @@ def _matrices(path: Path) -> dict[str, FloatArray]:
                 if found[name][0, 0] <= 0:
                     raise FileFormatError(f"{path}, line {number}: expected a positive focal length; got {numbers[0]}.")
         return found
+
+
+def baseline_of(left: FloatArray | None, right: FloatArray | None) -> float | None:
+    """Return the distance between two cameras with these projections (3, 4), right of each other; None without both."""
+    return None if left is None or right is None else float(left[0, 3] / left[0, 0] - right[0, 3] / right[0, 0])
 
 
 def _times(path: Path, count: int, warnings: list[str]) -> list[float] | None:

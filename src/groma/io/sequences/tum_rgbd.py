@@ -15,7 +15,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.bounded.names import listed_file
-from groma.bounded.text import finite, read_words
+from groma.bounded.text import finite, read_text, read_words
 from groma.errors import FileFormatError, InputError
 from groma.io.reading import reading
 from groma.io.sequences._calibration import Calibration, find_calibration, from_opencv
@@ -73,11 +73,16 @@ def pair_by_time(first: FloatArray, second: FloatArray, tolerance: float = TOLER
 
 
 def _freiburg(folder: Path) -> Calibration:
+    """Return the calibration of the benchmark's camera that the folder's name says, or the first lines of its files."""
     found = re.search(r"(?:freiburg|fr)([123])(?!\d)", folder.resolve().name.lower())
+    lists = [folder / name for name in ("rgb.txt", "depth.txt", "groundtruth.txt") if (folder / name).is_file()]
+    for path in lists:
+        with reading(path, "list of images"):
+            found = found or re.match(r"(?:#.*\n)*?# file:.*freiburg([123])(?!\d)", read_text(path))
     if found is None:
         raise InputError(
-            f"{folder} holds no camera, and its name does not say which of the three of the benchmark it is. Pass "
-            "one (--camera), such as '525 525 319.5 239.5', or put it into camera.txt."
+            f"{folder} holds no camera, and neither its name nor the first lines of its files say which of the three "
+            "of the benchmark it is. Pass one (--camera), such as '525 525 319.5 239.5', or put it into camera.txt."
         )
     return from_opencv(FREIBURG[found[1]], (640, 480))
 

@@ -36,6 +36,12 @@ def is_two_folders(folder: Path) -> bool:
     return all(_images(folder))
 
 
+def number_of(path: Path) -> int | str:
+    """Return the last number in the name of an image, else the name."""
+    digits = re.findall(r"\d+", path.stem)
+    return int(digits[-1][-18:]) if digits else path.stem
+
+
 def _images(folder: Path) -> tuple[list[Path], list[Path]]:
     """Return the images of colour and of depth; none of either where a folder has another layout."""
     depths = images_in(folder / DEPTH)
@@ -45,7 +51,7 @@ def _images(folder: Path) -> tuple[list[Path], list[Path]]:
         images = images_in(place)
         depths = [path for path in images if DEPTH in path.stem.lower()]
         colors = [path for path in images if DEPTH not in path.stem.lower()]
-        if depths and {_number(path) for path in depths} <= {_number(path) for path in colors}:
+        if depths and {number_of(path) for path in depths} <= {number_of(path) for path in colors}:
             return colors, depths
     return [], []
 
@@ -85,19 +91,14 @@ def _pairs(colors: list[Path], depths: list[Path]) -> dict[int, int]:
         first, second = (np.array([float(path.stem) for path in images]) for images in (colors, depths))
         pairs = dict(tum_rgbd.pair_by_time(first, second))
     else:
-        row_of = {_number(path): row for row, path in enumerate(depths)}
-        pairs = {row: row_of[_number(path)] for row, path in enumerate(colors) if _number(path) in row_of}
+        row_of = {number_of(path): row for row, path in enumerate(depths)}
+        pairs = {row: row_of[number_of(path)] for row, path in enumerate(colors) if number_of(path) in row_of}
     if not pairs:
         raise InputError(
             f"None of {counted(len(colors), 'colour images')}, such as {colors[0].name}, has the number or time of a "
             f"depth image, such as {depths[0].name}. Name them alike, or list them in associations.txt."
         )
     return pairs
-
-
-def _number(path: Path) -> int | str:
-    digits = re.findall(r"\d+", path.stem)
-    return int(digits[-1][-18:]) if digits else path.stem
 
 
 def _scale(depths: list[Path]) -> float:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Positions that cameras wrote into their photographs: the GPS part of EXIF, of JPEG and TIFF files.
+"""What cameras wrote into their photographs: positions, the GPS part of EXIF, of JPEG and TIFF files; orientations.
 
 Only what is asked for is read, at the head of a JPEG file and anywhere in a TIFF file, whose directories usually follow
 the pixels; damaged entries count as missing. How accurate they are, telephones write into EXIF, and receivers with
@@ -26,8 +26,12 @@ from groma.io.survey.coordinates import CoordinateSystem, Places
 
 #: Bytes of a JPEG file that are read: EXIF stands in one of the first segments, of 64 kB at most (cost: time only).
 _HEAD = 1 << 18
+#: Bytes in which the first directory of EXIF ends, far beyond what cameras write (cost: time only).
+_FIRST = 1 << 14
 #: Tags of the format.
-_GPS, _XMP, _RATIONAL = 0x8825, 700, 5
+_GPS, _XMP, _RATIONAL, _ORIENTATION = 0x8825, 700, 5, 0x0112
+#: Quarter turns to the right of the orientations that cameras write; mirrored ones are not turned.
+_TURNS = {3: 2, 6: 1, 8: 3}
 #: The tag of the horizontal error, metres, in the GPS part.
 _ERROR = 31
 #: Names of XMP for the standard deviations of east, north and height, metres.
@@ -72,6 +76,17 @@ def read_exif_positions(folder: str | os.PathLike[str], names: Sequence[str]) ->
         sigma[flat, 2] = 1e4
         notes.append(f"{counted(int(flat.sum()), 'photographs')} without a height in the EXIF.")
     return Places(tuple(found), table, sigma, CoordinateSystem("EPSG:4326"), "EXIF", tuple(notes), EXIF_SIGMA)
+
+
+def quarter_turns(path: str | os.PathLike[str]) -> int:
+    """Return the quarter turns to the right (0 to 3) that show a JPEG file upright; 0 where nothing is written."""
+    with suppress(OSError, struct.error), Path(path).open("rb") as file:
+        block = _exif_of(file.read(_FIRST))
+        if block is not None:
+            order = "<" if block[:2] == b"II" else ">"
+            entry = _entries(block, order, struct.unpack_from(order + "I", block, 4)[0]).get(_ORIENTATION)
+            return 0 if entry is None else _TURNS.get(struct.unpack_from(order + "H", block, entry[2])[0], 0)
+    return 0
 
 
 def _position_of(path: Path) -> list[float] | None:

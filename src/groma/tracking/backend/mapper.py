@@ -377,15 +377,16 @@ class Mapper:
             return None, None
         scene = map_to_scene(track_map, self.camera, min_views=1)
         searched = scene.num_points, scene.num_lines
+        once = int((np.bincount(scene.point_observations.point_idx, minlength=scene.num_points) == 1).sum())
         found = find_planes(track_map, scene, gates)
         if not found:
-            return None, PlaneOutcome(searched, 0, 0)
+            return None, PlaneOutcome(searched, once, 0, 0)
         report = self._adjust_all()
         dropped, gone = drop_what_failed(track_map, self.camera, gates)
         if dropped or gone:
             report = self._adjust_all()
         points, lines = (int((table.alive & (table.plane >= 0)).sum()) for table in (track_map.points, track_map.lines))
-        return report, PlaneOutcome(searched, found, found - gone, points, lines, dropped)
+        return report, PlaneOutcome(searched, once, found, found - gone, points, lines, dropped)
 
 
 def _follow_world(present: Present, new_from_old: FloatArray) -> None:

@@ -23,8 +23,9 @@ from groma.tracking.result import map_to_scene
 class PlaneOutcome:
     """What became of the planes that were found in the points and lines of a map."""
 
-    #: Points and lines that were searched.
+    #: Points and lines that were searched, and points among them that one keyframe saw: they are in no result.
     searched: tuple[int, int]
+    once: int
     #: Planes found, and those that held.
     found: int
     held: int
@@ -36,7 +37,8 @@ class PlaneOutcome:
     @property
     def sentence(self) -> str:
         """The message."""
-        among = f"{counted(self.searched[0], 'points')} and {counted(self.searched[1], 'lines')} of the map"
+        once = f" ({self.once:,} of them in one keyframe alone, which are not written)" if self.once else ""
+        among = f"{counted(self.searched[0], 'points')}{once} and {counted(self.searched[1], 'lines')} of the map"
         if not self.found:
             return f"No planes: none stands out from the {among}."
         if not self.held:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -15,8 +16,10 @@ from groma import cameras
 from groma._counted import natural_key
 from groma._typing import FloatArray, IntArray
 from groma.execution import begin
+from groma.io.survey.exif import quarter_turns
 from groma.scene import Scene
 from groma.scene.line_intervals import one_line_per_interval
+from groma.scene.local_frame import up_of
 from groma.scene.table import new_index_of
 from groma.viz.drawable import Drawable
 from groma.viz.pack import pack, pack_whole, thin
@@ -30,12 +33,20 @@ PHOTO_SIZE = 1100
 PHOTO_BUDGET = 9_000_000
 #: Places along the image of a segment that lens distortion bends.
 _SAMPLES = 6
-#: Returns data URLs of photographs, in the order of the images with observations.
-Photographs = Callable[[], list[str]]
+
+
+@dataclass(frozen=True)
+class Photographs:
+    """Photographs of a page that are being read, in the order of the images with observations."""
+
+    #: Returns their data URLs; empty where there is none.
+    addresses: Callable[[], list[str]]
+    #: Quarter turns to the right that show each upright.
+    turns: list[int]
 
 
 def page_photographs(scene: Scene, images: ImageFiles | None) -> Photographs:
-    """Start to read the photographs of a page, at a size that depends on their number; empty where there is none.
+    """Start to read the photographs of a page, at a size that depends on their number.
 
     They depend only on which images have observations, so they can be read before the page is written.
     """
@@ -48,7 +59,15 @@ def _photographs(names: Sequence[str], images: ImageFiles | None) -> Photographs
     chosen = np.array(list(files))[thin(len(files), MAX_PHOTOS)].tolist() if files else []
     budget = PHOTO_BUDGET // max(len(chosen), 1)
     begun = {place: begin(partial(_photograph, files[place], budget)) for place in chosen}
-    return lambda: [begun[place]() if place in begun else "" for place in range(len(names))]
+    turns = [quarter_turns(files[place]) if place in files else 0 for place in range(len(names))]
+    return Photographs(lambda: [begun[place]() if place in begun else "" for place in range(len(names))], turns)
+
+
+def up_in_page(scene: Scene, photographs: Photographs) -> FloatArray:
+    """Return the direction (3,) that is up, the photographs shown upright."""
+    turns = np.zeros(scene.num_images, np.int64)
+    turns[_used(scene)] = photographs.turns
+    return up_of(scene, turns)
 
 
 def _photograph(file: Path, budget: int) -> str:
@@ -92,7 +111,7 @@ def image_data(scene: Scene, kept: Kept, states: Sequence[Drawable], photographs
     ]
     ways = [state.residuals[num_points:].reshape(-1, 4)[segments] for state in states]
     point_ways = [state.residuals[:num_points][rows] for state in states]
-    entries, photos = [], photographs()
+    entries, photos = [], photographs.addresses()
     for place, image in enumerate(used.tolist()):
         left, top, width, height = _frame(after, image)
         entries.append(
@@ -104,6 +123,7 @@ def image_data(scene: Scene, kept: Kept, states: Sequence[Drawable], photographs
                 "points_seen": int(points_seen[image]),
                 "lines_seen": int(lines_seen[image]),
                 "frame": [left, top, width, height],
+                "turn": photographs.turns[place],
                 "median": [float(state.median_by_image[image]) for state in states],
                 "photo": photos[place] if left == top == 0.0 else "",
             }

@@ -16,7 +16,7 @@ import html
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -36,7 +36,7 @@ from groma.viz.report import charts as _charts
 from groma.viz.report import tables as _page_tables
 from groma.viz.report.covariances import LandmarkCovariances
 from groma.viz.report.data import scene_data
-from groma.viz.report.images import Photographs, image_data, page_photographs
+from groma.viz.report.images import Photographs, image_data, page_photographs, up_in_page
 from groma.viz.report.kept import kept
 
 #: The scripts of the page, in order.
@@ -147,8 +147,9 @@ def write_report(
         diagnosis = numbers.get("diagnosis")
     script = '"use strict";\n' + "".join(_part(f"{name}.js") for name in SCRIPTS)
     held = kept(scene_after)
-    of_scene = begin(partial(scene_data, scenes, states, held, said.covariances))
     photographs = said.photographs or page_photographs(scene_after, images)
+    states[-1] = replace(after, up=up_in_page(scene_after, photographs))
+    of_scene = begin(partial(scene_data, scenes, states, held, said.covariances))
     parts = {
         "POLICY": _policy(script),
         "STYLE": _part("page.css"),

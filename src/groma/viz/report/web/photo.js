@@ -18,6 +18,16 @@ function pictureOf(index) { // decoded when it is first looked at
   const one = pictures.get(index);
   return one.complete && one.naturalWidth ? one : null;
 }
+// From pixels of a photograph, turned upright about its middle, to a canvas on which the middle is at x, y.
+function upright(entry, scale, x, y) {
+  const [left, top, width, height] = entry.frame, [a, b] = [[1, 0], [0, 1], [-1, 0], [0, -1]][entry.turn].map(part => scale * part);
+  const u0 = left + width / 2, v0 = top + height / 2;
+  return {
+    at: (u, v) => [a * (u - u0) - b * (v - v0) + x, b * (u - u0) + a * (v - v0) + y],
+    draw: (c, picture) => { c.setTransform(a, b, -b, a, x, y); c.drawImage(picture, -width / 2, -height / 2, width, height); c.resetTransform(); },
+  };
+}
+const uprightSize = entry => entry.turn % 2 ? [entry.frame[3], entry.frame[2]] : entry.frame.slice(2);
 // Strokes of segments (measured), and of the images of the 3D segments.
 function traceSegment(c, i, at) {
   const k = i * segmentStep;
@@ -52,17 +62,17 @@ function drawLit(c, index, at, width) {
 }
 function drawImage() {
   if (!data.images.length) return;
-  const entry = data.images[current], [left, top, width, height] = entry.frame, gain = +$("gain").value, s = photoState();
+  const entry = data.images[current], [width, height] = uprightSize(entry), gain = +$("gain").value, s = photoState();
   const ratio = Math.min(devicePixelRatio || 1, 2), wide = Math.max(300, Math.round((sheet.parentElement.clientWidth || 600) * ratio));
   const high = Math.min(Math.round(wide * height / width), Math.round(640 * ratio));
   if (sheet.width !== wide || sheet.height !== high) { sheet.width = wide; sheet.height = high; }
   const c = sheet.getContext("2d"), fit = Math.min(1, high / (wide * height / width)), scale = wide / width * fit * zoom.scale;
   const shift = [(wide - width * scale / zoom.scale) / 2 + zoom.x, zoom.y];
-  const at = (u, v) => [(u - left) * scale + shift[0], (v - top) * scale + shift[1]];
+  const { at, draw } = upright(entry, scale, shift[0] + width * scale / 2, shift[1] + height * scale / 2);
   page = { at, shift, ratio };
   const dark = !!entry.photo, picture = layers.photo ? pictureOf(current) : null; // without a photograph the ground is that of the page
   c.fillStyle = dark ? "#26292e" : colourOf("view"); c.fillRect(0, 0, wide, high);
-  if (picture) { c.globalAlpha = 0.85; c.drawImage(picture, ...at(left, top), width * scale, height * scale); c.globalAlpha = 1; }
+  if (picture) { c.globalAlpha = 0.85; draw(c, picture); c.globalAlpha = 1; }
   c.lineCap = "round"; c.globalAlpha = chosen && chosen.kind !== "camera" ? 0.25 : 1;
   if (layers.projected) {
     c.strokeStyle = dark ? "#ffffffd0" : colourOf("soft"); c.lineWidth = ratio; c.beginPath();
@@ -70,7 +80,7 @@ function drawImage() {
     c.stroke();
   }
   if (layers.segments) drawSegments(c, entry, at, s, 2 * ratio);
-  if (layers.points) drawResiduals(c, entry, at, s, gain * scale, ratio, dark);
+  if (layers.points) drawResiduals(c, entry, at, s, gain, ratio, dark);
   c.globalAlpha = 1;
   drawLit(c, current, at, 3 * ratio);
   if (pointed && pointed.kind === "line") {
@@ -95,7 +105,7 @@ function drawResiduals(c, entry, at, state, gain, ratio, dark) {
   for (let i = entry.rows[0]; i < entry.rows[1]; i++) {
     const k = i * rowStep, w = k + 2 + 2 * state, [u, v] = at(rows[k], rows[k + 1]);
     c.fillRect(u - ratio, v - ratio, 2 * ratio, 2 * ratio);
-    c.moveTo(u, v); c.lineTo(u + gain * rows[w], v + gain * rows[w + 1]);
+    c.moveTo(u, v); c.lineTo(...at(rows[k] + gain * rows[w], rows[k + 1] + gain * rows[w + 1]));
   }
   c.stroke();
 }

@@ -19,11 +19,10 @@ async function load(index) {
   drawThumb(index);
 }
 function drawThumb(index) {
-  const thumb = thumbs[index], [left, top, width, height] = data.images[index].frame, c = thumb.one.firstChild.getContext("2d");
-  const scale = Math.max(THUMB[0] / width, THUMB[1] / height), shift = [(THUMB[0] - width * scale) / 2, (THUMB[1] - height * scale) / 2];
-  const at = (u, v) => [(u - left) * scale + shift[0], (v - top) * scale + shift[1]];
+  const thumb = thumbs[index], entry = data.images[index], [width, height] = uprightSize(entry), c = thumb.one.firstChild.getContext("2d");
+  const { at, draw } = upright(entry, Math.max(THUMB[0] / width, THUMB[1] / height), THUMB[0] / 2, THUMB[1] / 2);
   c.fillStyle = "#26292e"; c.fillRect(0, 0, ...THUMB);
-  if (thumb.bitmap) c.drawImage(thumb.bitmap, ...at(left, top), width * scale, height * scale);
+  if (thumb.bitmap) draw(c, thumb.bitmap);
   c.lineCap = "round";
   if (chosen) drawLit(c, index, at, 5);
 }
