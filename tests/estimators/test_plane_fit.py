@@ -81,6 +81,18 @@ def test_walls_among_clutter():
     assert (label[800:] >= 0).mean() < 0.15
 
 
+def test_others_are_found_beside_planes_that_are_known():
+    rng = np.random.default_rng(2)
+    points = np.concatenate([wall(rng, 300, 0, 0.0), wall(rng, 300, 1, 0.0), wall(rng, 200, 2, 0.0)])
+    found = find_planes(points, noise_of(points))
+    known = found.take(np.array([1]), np.array([-1, 0, -1]))
+    again = find_planes(points, noise_of(points), known=known)
+    assert len(found) == len(again) == 3
+    np.testing.assert_array_equal(again.planes[0], found.planes[1])
+    assert (again.point_label == 0)[known.point_label == 0].all()
+    assert sorted(np.abs(again.planes[:, :3]).argmax(axis=1)) == [0, 1, 2]
+
+
 def test_no_plane_in_clutter_and_none_in_a_blob():
     rng = np.random.default_rng(3)
     cloud = rng.uniform(0, 4, (600, 3))

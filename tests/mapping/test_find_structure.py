@@ -14,6 +14,7 @@ from groma.errors import InputError
 from groma.geometry import quaternion
 from groma.io import read_scene
 from groma.mapping.noise.landmarks import line_noise, point_noise
+from groma.mapping.structure import find
 from groma.mapping.structure.find import StructureOptions, detect_structure, find_structure, landmark_noise
 from groma.scene import Directions, Planes, Relations, RightColumns, Scene
 from groma.scene.synthetic.scenes import corridor, holistic
@@ -196,3 +197,21 @@ def test_facade_of_real_church(shared_data):
     # The church has one front; its parallel layers agree in direction.
     cosine = np.abs(structure.planes.planes[:, :3] @ structure.planes.planes[0, :3])
     assert (cosine > np.cos(0.05))[:3].all()
+
+
+def test_a_plane_that_was_lost_among_the_pieces_of_another_is_found_again(monkeypatch):
+    """As if pieces of a wall had held its landmarks, it is gone after planes were joined."""
+    _, scene = measured("corridor", "tiny")
+    usual, fitted, calls = find_structure(scene), find.on_fitted_planes, []
+
+    def losing(marks, planes, *args, **kwargs):
+        calls.append(len(planes))
+        if len(calls) == 1:
+            planes = planes.take(np.arange(1, len(planes)), np.arange(-1, len(planes) - 1))
+        return fitted(marks, planes, *args, **kwargs)
+
+    monkeypatch.setattr(find, "on_fitted_planes", losing)
+    again = find_structure(scene)
+    assert len(calls) == 2 and again.num_planes == usual.num_planes > 1
+    normals = usual.planes.hesse[:, :3]
+    np.testing.assert_allclose(np.abs(normals @ again.planes.hesse[:, :3].T).max(axis=1), 1.0, atol=1e-4)

@@ -10,7 +10,7 @@ from groma.estimators.plane_search import PlaneSet
 from groma.gates import chi_square_gate
 from groma.mapping.noise.landmarks import LineNoise, PointNoise
 from groma.mapping.structure.relations import Landmarks, on_planes, spacings
-from groma.mapping.structure.rough_planes import _spread, on_fitted_planes
+from groma.mapping.structure.rough_planes import _leans, _spread, on_fitted_planes, released
 from groma.scene import LineIntervals
 
 SIGMA, LEVEL, LEAST, SUPPORT = 0.002, 0.99, (0.7, 0.9), 20
@@ -232,11 +232,37 @@ def test_turns_scatter_as_expected_with_the_variance_found():
     for number in range(2, 8):
         roots = rng.normal(size=(number, 2, 2)) * 1e-3
         noise, turned = roots @ roots.mT + 1e-8 * np.eye(2), rng.normal(size=(number, 2)) * 0.01
-        spread = _spread(turned, noise, 2 * number - 2)
-        information = np.linalg.inv(noise + spread * np.eye(2))
+        shape = np.linalg.inv(noise[::-1] + np.eye(2) * rng.uniform(0.1, 1.0, (number, 1, 1)))
+        spread = _spread(turned, noise, shape, 2 * number - 2)
+        information = np.linalg.inv(noise + spread * shape)
         mean = np.linalg.solve(information.sum(axis=0), np.einsum("kab,kb->a", information, turned))
         chi_square = np.einsum("ka,kab,kb->", turned - mean, information, turned - mean)
         assert spread > 0.0
         assert chi_square == pytest.approx(2 * number - 2, rel=1e-9)
-    assert _spread(turned * 1e-3, noise, 2 * number - 2) == 0.0  # within their noise
-    assert _spread(turned[:1], noise[:1], 0) == 0.0
+    assert _spread(turned * 1e-3, noise, shape, 2 * number - 2) == 0.0  # within their noise
+    assert _spread(turned[:1], noise[:1], shape[:1], 0) == 0.0
+
+
+@pytest.mark.parametrize(("turns", "leans"), [([0.0, 3.0, 3.0, 3.5], False), ([3.0, 3.0, 3.0, 3.5], True)])
+def test_narrow_pieces_turned_alike_do_not_outvote_a_wide_one(turns, leans):
+    """The roughness of a wall turns a piece of a quarter of its width four times as much."""
+    marks, slope = wall(0.0, num_points=1200, num_lines=0), 1e-3 * np.array(turns)
+    strip = np.digitize(marks.points[:, 0], [0.5, 1.0, 1.5])  # 2.5 wide, and three of 0.5
+    pieces = pieces_of(marks, np.zeros(4), [strip == k for k in range(4)])
+    pieces.planes[:, 0] = slope
+    whole = pieces_of(marks, [0.0], [np.ones(1200, bool)])
+    assert _leans(whole, pieces, [0, 1, 2, 3]) == leans
+
+
+def test_landmarks_that_a_joined_plane_does_not_pass_through_are_free_again():
+    marks = wall(0.0, before=0.1)
+    on = np.array([np.full(400, True)])
+    joined = pieces_of(marks, [0.0], on)
+    joined = replace(joined, segment_label=np.zeros(40, int))
+    marks.segments[0, 1, 2] = 0.1  # one end is off
+    points, lines = on_planes(marks, joined, LEVEL, LEAST)
+    beside = int(np.setdiff1d(np.flatnonzero(~panel(marks.points)), points.pairs[:, 0])[0])  # in the layer, no member
+    known = released(marks, joined, points, lines)
+    np.testing.assert_array_equal(known.point_label, np.where(panel(marks.points), -1, 0))
+    assert known.point_label[beside] == 0 and known.segment_label.tolist() == [-1] + [0] * 39
+    np.testing.assert_array_equal(joined.point_label, 0)  # not changed

@@ -50,6 +50,7 @@ from groma.estimators._plane_candidates import (
 )
 from groma.estimators._plane_growth import Grower, Grown, Growth, connected_to
 from groma.estimators._plane_options import PLANE_SEARCH, PlaneOptions
+from groma.estimators.plane_fit import PlaneFit
 from groma.execution import begin
 from groma.gates import chi_square_gate
 from groma.geometry.algebra import vectors
@@ -60,6 +61,8 @@ BAND = PLANE_SEARCH.band
 _SCORED_TOGETHER = 16
 #: Failures in a row from which on the next candidate is grown ahead, as it will probably be needed (cost: time only).
 _AHEAD = 2
+#: Features that planes which are known already take out.
+_NONE = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True)
@@ -112,6 +115,7 @@ def find_planes(
     options: PlaneOptions | None = None,
     carriers: IntArray | None = None,
     progress: Callable[[int, int], None] | None = None,
+    known: PlaneSet | None = None,
 ) -> PlaneSet:
     """Find planes in points and segments; see the module.
 
@@ -132,6 +136,8 @@ def find_planes(
         nothing more about whether there is a plane.
     progress : callable, optional
         Called with the number of candidates that are settled, and of all.
+    known : PlaneSet, optional
+        Planes beside which others are sought, in what has no label of theirs. They are the first that are returned.
 
     Returns
     -------
@@ -168,8 +174,13 @@ def find_planes(
     labels = np.full(len(places), -1)
     say = progress or (lambda done, total: None)
     found: list[Grown] = []
+    if known is not None:
+        labels = np.concatenate([known.point_label, np.repeat(known.segment_label, 2)])
+        fits = [PlaneFit(*one, 1.0) for one in zip(known.planes, known.covariance, strict=True)]
+        rest = known.share, known.band, known.log10_false_alarms, known.places, [_NONE] * len(fits)
+        found = [Grown(*one) for one in zip(fits, *rest, strict=True)]
     if len(places) >= max(options.min_support, 4):  # derived from three that fix a plane
-        found = _extract(places, noise, partner, carrier, len(points), labels, options, say)
+        _extract(places, noise, partner, carrier, len(points), labels, found, options, say)
     fits = [grown.fit for grown in found]
     end_label = labels[len(points) :].reshape(-1, 2)
     return PlaneSet(
@@ -192,12 +203,13 @@ def _extract(
     carrier: IntArray,
     num_points: int,
     filled: IntArray,
+    found: list[Grown],
     options: PlaneOptions,
     progress: Callable[[int, int], None],
-) -> list[Grown]:
-    """Find planes, then rough ones; ``filled`` gets their numbers."""
-    features, labels = features_of(places, noise, partner, carrier), np.full(len(places), -1)
-    found: list[Grown] = []
+) -> None:
+    """Find planes, then rough ones, beside those ``found``, which is added to; ``filled`` gets their numbers."""
+    features = features_of(places, noise, partner, carrier)
+    labels = filled[features.given]
     gate, settled = chi_square_gate(1.0 - options.level, 1), 0
 
     def say(done: int, total: int) -> None:
@@ -222,7 +234,6 @@ def _extract(
             candidates, homes = from_planes(one, planes, labels, rng)
             num_tried += len(candidates)
     filled[features.given] = labels
-    return found
 
 
 def _extract_of(

@@ -26,7 +26,7 @@ from functools import partial
 
 import numpy as np
 
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.plane_fit import PlaneFit, fit_plane, plane_motions
 from groma.estimators.plane_search import PlaneSet, connected_to
 from groma.execution import map_in_threads
@@ -168,11 +168,14 @@ def _whole(
 
 
 def _leans(whole: PlaneSet, planes: PlaneSet, group: list[int]) -> bool:
-    """Whether a plane leans against what may be its pieces, beyond how these are turned against each other."""
+    """Whether a plane leans against what may be its pieces, beyond how these are turned against each other.
+
+    The roughness of a wall displaces parts of it: it turns a piece the more, the less that extends.
+    """
     basis = np.stack(perpendicular(whole.planes[0, :3]))
     turned, noise = _turned(basis, planes, group)
-    spread = _spread(turned, noise, 2 * len(group) - 2)
-    information = np.linalg.inv(noise + spread * np.eye(2))
+    shape = np.linalg.inv([np.cov(planes.places[b] @ basis.T, rowvar=False) for b in group])
+    information = np.linalg.inv(noise + _spread(turned, noise, shape, 2 * len(group) - 2) * shape)
     known = np.linalg.inv(information.sum(axis=0))
     mean = known @ np.einsum("kab,kb->a", information, turned)
     known = known + basis @ whole.covariance[0, :3, :3] @ basis.T
@@ -184,7 +187,9 @@ def _contradict(planes: PlaneSet, group: list[int], level: float) -> bool:
     if len(group) < 3:
         return False
     basis = np.stack(perpendicular(planes.planes[group[0], :3]))
-    return _spread(*_turned(basis, planes, group), chi_square_gate(1.0 - level, 2 * len(group) - 2)) > 0.0
+    turned, noise = _turned(basis, planes, group)
+    shape = np.broadcast_to(np.eye(2), noise.shape)
+    return _spread(turned, noise, shape, chi_square_gate(1.0 - level, 2 * len(group) - 2)) > 0.0
 
 
 def _turned(basis: FloatArray, planes: PlaneSet, group: list[int]) -> tuple[FloatArray, FloatArray]:
@@ -194,18 +199,18 @@ def _turned(basis: FloatArray, planes: PlaneSet, group: list[int]) -> tuple[Floa
     return sign[:, None] * normal @ basis.T, basis @ planes.covariance[group, :3, :3] @ basis.T
 
 
-def _spread(turned: FloatArray, noise: FloatArray, expected: float) -> float:
-    """Variance by which turns (K, 2) scatter beyond their noise: with it their chi-square is what is expected.
+def _spread(turned: FloatArray, noise: FloatArray, shape: FloatArray, expected: float) -> float:
+    """By how many covariances ``shape`` (K, 2, 2) turns (K, 2) scatter beyond their noise: chi-square is as expected.
 
     The chi-square about the mean falls with the variance and is convex: Newton's steps from zero never pass the root.
     """
     variance = 0.0
     while True:
-        information = np.linalg.inv(noise + variance * np.eye(2))
+        information = np.linalg.inv(noise + variance * shape)
         mean = np.linalg.solve(information.sum(axis=0), np.einsum("kab,kb->a", information, turned))
         pull = np.einsum("kab,kb->ka", information, turned - mean)
         excess = float(np.einsum("ka,ka->", turned - mean, pull)) - expected
-        step = excess / max(float((pull**2).sum()), 1e-300)
+        step = excess / max(float(np.einsum("ka,kab,kb->", pull, shape, pull)), 1e-300)
         if expected <= 0.0 or not step > 1e-12 * variance:  # nothing is expected of a plane alone
             return variance
         variance += step
@@ -335,3 +340,22 @@ def _pieces(points: Pairs, lines: Pairs, before: tuple[Pairs, Pairs], into: IntA
         numbers.append(np.repeat(number, ends))
         free += len(mark)
     return np.concatenate(numbers)
+
+
+def released(marks: Landmarks, planes: PlaneSet, points: Pairs, lines: Pairs) -> PlaneSet:
+    """Return planes with labels of what lies on them; what they were found in, but is beyond the layer, is free."""
+
+    def labels(before: IntArray, usable: BoolArray, places: FloatArray, found: Pairs) -> IntArray:
+        label = np.full(len(usable), -1)
+        label[usable] = before
+        plane = planes.planes[label]
+        height = np.abs(np.einsum("nki,ni->nk", places, plane[:, :3]) + plane[:, 3:]).max(axis=1)
+        label[height > planes.band[label]] = -1
+        label[found.pairs[:, 0]] = found.pairs[:, 1]
+        return label[usable]
+
+    return replace(
+        planes,
+        point_label=labels(planes.point_label, marks.point_usable, marks.points[:, None], points),
+        segment_label=labels(planes.segment_label, marks.line_usable, marks.segments, lines),
+    )
