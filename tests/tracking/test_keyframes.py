@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Keyframes: each is another frame, whatever failed on the way; described features in all parts of an image."""
 
+import math
 from dataclasses import replace
 
 import _room
@@ -14,13 +15,15 @@ from groma.tracking.backend.local_adjustment import window_job
 from groma.tracking.backend.loop_closure import LoopSearch
 from groma.tracking.backend.mapper import Mapper
 from groma.tracking.frame.camera import TrackCamera
-from groma.tracking.frame.features import Features, describe
+from groma.tracking.frame.features import Features, FrameFeatures, describe
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
 from groma.tracking.map.culling import drop_unseen
 from groma.tracking.map.landmarks import ALIVE, DEAD
 from groma.tracking.map.map_scene import stacked
 from groma.tracking.map.points import PointTracks, find_again
 from groma.tracking.map.track_map import Keyframe, TrackMap
+from groma.tracking.pose import following
+from groma.tracking.pose.following import follow_frame
 from groma.tracking.pose.verification import PoseVerification, misses_much
 
 OPTIONS = TrackOptions(num_points=250, num_features=500)
@@ -58,6 +61,31 @@ def test_each_keyframe_is_another_frame(kind, monkeypatch):
     assert len(np.unique(pairs, axis=0)) == len(pairs)
     assert np.bincount(pairs[:, 1], minlength=result.scene.num_points).min() >= 2
     assert _room.position_error(result.trajectory, _wide(12)) < 0.02
+
+
+@pytest.mark.parametrize(("step", "calls"), [(1, 2), (12, 1)])
+def test_where_most_points_are_gone_after_a_searched_frame_the_others_are_not_followed(step, calls, monkeypatch):
+    asked, carry_on = [], following.follow_points
+    monkeypatch.setattr(following, "follow_points", lambda *all: (asked.append(len(all[2])), carry_on(*all))[1])
+    frames = _room.frames("rgbd", _room.poses(6 + step))
+    tracker = Tracker(_room.camera(), OPTIONS)
+    for frame in frames[:6]:
+        tracker.process(frame)
+    track_map, present = tracker.map, tracker._present
+    data = FrameFeatures(frames[-1], TrackCamera.of(_room.camera()), OPTIONS)
+    expected = present.pose, np.full(6, 0.1)
+    given = track_map, present.data, data, present.followed, present.pose, expected, Stopwatch()
+    whole, followed = follow_frame(*given)
+    asked.clear()
+    estimate, part = follow_frame(*given, searched=True)
+    assert len(asked) == calls
+    assert asked[0] == math.ceil(len(present.followed.points) / 4)
+    if calls == 1:
+        assert estimate is None and not len(part.points) and not len(part.lines)
+    else:
+        np.testing.assert_array_equal(estimate.pose, whole.pose)
+        np.testing.assert_array_equal(part.points.index, followed.points.index)
+    tracker.finish()
 
 
 def test_what_is_worked_out_is_taken_up_before_a_frame_is_searched():
@@ -110,8 +138,11 @@ def test_keyframes_are_compared_by_what_stands_out_in_both():
         return Keyframe(index, 0.0, "", se3.identity(), gray, Measurements.empty(), features, np.zeros(1))
 
     strong, weak = np.arange(300.0), -np.arange(300.0)
-    found = LoopSearch(seen(2, strong), [seen(0, weak), seen(1, strong)], gates).run()
-    assert [(keyframe.index, len(first)) for keyframe, first, _ in found] == [(1, 300)]
+    candidates = [seen(0, weak), seen(1, strong)]
+    search = LoopSearch(seen(2, strong), candidates, gates)
+    candidates[1].forget()  # as a keyframe that is dropped while other threads search
+    assert [(keyframe.index, len(first)) for keyframe, first, _ in search.run()] == [(1, 300)]
+    assert search.run()[0][0] is candidates[1]
 
 
 @pytest.mark.parametrize(("rate", "frames"), [(10.0, 2), (30.0, 3), (60.0, 4)])

@@ -7,7 +7,7 @@ import pytest
 
 from groma.geometry import se3
 from groma.tracking import Tracker, TrackOptions
-from groma.tracking.backend.loop_closure import search_for_loop
+from groma.tracking.backend.loop_closure import agreeing_pose, search_for_loop
 from groma.tracking.backend.metric_loops import adjusted_with
 from groma.tracking.backend.place_again import KnownMap, PlaceAgain, measure_place
 from groma.tracking.pose.relocalise import known_features
@@ -106,6 +106,24 @@ def test_another_place_that_looks_alike_is_left_out(drifted):
     """
     assert _after(drifted, _place(drifted, 2.0, 0.005)) is None
     assert _after(drifted, _place(drifted, 2.0, 50.0)) is not None
+
+
+def test_a_search_asks_the_map_as_it_was(drifted):
+    """Matches agree on a pose, or not, whatever becomes of the map while other threads search."""
+    track_map, camera, gates = drifted.map.copy(), drifted.camera, drifted.options.gates
+    searches, expected = [], []
+    for newest in track_map.living():
+        search = search_for_loop(track_map, newest, gates)
+        for keyframe, *matches in search.run() if search is not None else []:
+            if agreeing_pose(track_map, camera, keyframe, newest, *matches, gates) is not None:
+                expected.append((newest.index, keyframe.index))
+        searches.append(search_for_loop(track_map, newest, gates, camera))
+    assert expected
+    track_map.points.xyz[:] = 0.0
+    for keyframe in track_map.living():
+        keyframe.pose = se3.identity()
+    found = [(search.newest.index, pair[0].index) for search in searches if search is not None for pair in search.run()]
+    assert found == expected
 
 
 def test_deviations_of_places_are_those_of_their_errors(drifted):

@@ -9,7 +9,11 @@ pose. Its uncertainty is estimated by :mod:`groma.tracking.backend.place_again`;
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from copy import copy
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +28,7 @@ from groma.tracking.map.feature_points import match_features
 from groma.tracking.map.landmarks import ALIVE, DEAD
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.pose.depth_check import depth_agreement
-from groma.tracking.pose.relocalise import feature_places, pose_from_matches
+from groma.tracking.pose.relocalise import PlacesOnly, feature_places, pose_from_matches
 
 
 @dataclass(frozen=True)
@@ -34,17 +38,24 @@ class LoopSearch:
     newest: Keyframe
     candidates: list[Keyframe]
     gates: TrackingGates
+    #: Whether matches of a candidate agree on a pose; None: that is asked later.
+    agrees: Callable[[Keyframe, IntArray, IntArray], bool] | None = None
+    #: The candidates as they are when the search begins: meanwhile the map changes.
+    _known: list[Keyframe] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_known", [copy(keyframe) for keyframe in self.candidates])
 
     def run(self) -> list[tuple[Keyframe, IntArray, IntArray]]:
         """Return the candidates whose descriptions match best, with the rows of the pairs; no access to the map."""
         features, gates, max_bits = self.newest.features, self.gates.loops, self.gates.features.max_bits
         voters = _strongest(features, gates.voters)
-        others = (_strongest(other.features, gates.voters) for other in self.candidates)
+        others = (_strongest(other.features, gates.voters) for other in self._known)
         votes = np.array([len(pair_anywhere(other, voters, max_bits)[0]) for other in others])
         out = []
         for k in np.argsort(-votes, kind="stable")[: gates.searched]:
-            first, second = match_features(self.candidates[k].features, features, max_bits)
-            if len(first) >= gates.min_matches:
+            first, second = match_features(self._known[k].features, features, max_bits)
+            if len(first) >= gates.min_matches and (self.agrees is None or self.agrees(self._known[k], first, second)):
                 out.append((self.candidates[k], first, second))
         return out
 
@@ -54,8 +65,13 @@ def _strongest(features: Features, count: int) -> Descriptors:
     return features.descriptor[np.argsort(-features.response, kind="stable")[:count]]
 
 
-def search_for_loop(track_map: TrackMap, newest: Keyframe, gates: TrackingGates) -> LoopSearch | None:
-    """Return the search that a keyframe is worth, or None if it sees what older ones see anyway."""
+def search_for_loop(
+    track_map: TrackMap, newest: Keyframe, gates: TrackingGates, camera: TrackCamera | None = None
+) -> LoopSearch | None:
+    """Return the search that a keyframe is worth, or None if it sees what older ones see anyway.
+
+    With a camera, matches that agree on no pose in the map as it is now are left out.
+    """
     living = [k for k in track_map.living() if k.index < newest.index - gates.loops.gap]
     if not living:
         return None
@@ -63,7 +79,23 @@ def search_for_loop(track_map: TrackMap, newest: Keyframe, gates: TrackingGates)
     if shared.max(initial=0) >= gates.loops.shared:
         return None
     chosen = np.unique(np.linspace(0, len(living) - 1, gates.loops.compared).astype(int))
-    return LoopSearch(newest, [living[k] for k in chosen], gates)
+    agrees = None
+    if camera is not None:
+        points: Any = PlacesOnly(track_map.points.xyz.copy(), track_map.points.state.copy())
+        agrees = partial(_agrees, replace(track_map, points=points), camera, newest, gates)
+    return LoopSearch(newest, [living[k] for k in chosen], gates, agrees)
+
+
+def _agrees(
+    track_map: TrackMap,
+    camera: TrackCamera,
+    newest: Keyframe,
+    gates: TrackingGates,
+    keyframe: Keyframe,
+    first: IntArray,
+    second: IntArray,
+) -> bool:
+    return agreeing_pose(track_map, camera, keyframe, newest, first, second, gates) is not None
 
 
 def can_be(

@@ -260,7 +260,7 @@ class Mapper:
         if 0 < newest == self.current and newest not in self.joints:
             return search_older_maps(self.maps, self.map.last, self.options.gates)
         # Loops of a monocular track are closed at the end, since its scale changes then.
-        return search_for_loop(self.map, self.map.last, self.options.gates) if self.metric else None
+        return search_for_loop(self.map, self.map.last, self.options.gates, self.camera) if self.metric else None
 
     def _close_loop(self, present: Present, search: LoopSearch, pairs: list) -> None:
         if search.newest is not self.map.keyframes[search.newest.index]:

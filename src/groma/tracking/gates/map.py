@@ -32,6 +32,7 @@ class PointGates:
     patch_keyframes: int = gate(2, "keyframes", "whose patches are looked for in one frame", "cost: time per frame")
     again_radius: float = gate(6.0, "px", "distance at which a point of the map is found again", SEQUENCES)
     again_room: float = gate(0.2, "share", "share of the wanted points that must be missing", "cost: time per frame")
+    first_of: int = gate(4, "points", "of which one is followed before the others", "cost: time per searched frame")
     min_parallax: float = gate(0.015, "rad", "angle between rays that place a point", SEQUENCES)
     max_error: float = gate(2.5, "px", "distance of a placed point from its pixels", SEQUENCES)
     max_misses: int = gate(12, "frames", "a point not found in so many frames in a row is dropped", SEQUENCES)

@@ -54,21 +54,30 @@ def follow_frame(
 
     ``expected`` is the predicted pose with its standard deviations (6,). Lines and planes are found beside points in a
     pool. Where so many points are gone that features will be asked anyway, lines are not followed, unless few are left:
-    without lines their pose is a poor guess. Lines do not begin before points if the frame before was ``searched``.
+    without lines their pose is a poor guess. If the frame before was ``searched``, lines do not begin before points,
+    and a part of the points is followed first: where most of it is gone, so are the others, and features are asked.
     """
     camera, options, gates = data.camera, data.options, data.options.gates
     predicted, prior_sigma = expected
     tracks, segments = followed.points, followed.lines
+    tracks = tracks.take(track_map.points.state[tracks.index] != DEAD)
+
+    def carry_on(some: PointTracks) -> PointTracks:
+        with watch("points"):
+            return follow_points(
+                track_map, camera, some, before.gray, data.gray, predicted, previous, POINT_TRACKS.max_shift
+            )
+
+    if options.points and searched:
+        part = tracks.take(np.arange(0, len(tracks), gates.points.first_of))
+        left = int(track_map.points.alive[carry_on(part).index].sum())
+        if misses_much(track_map, camera, part, predicted, left, gates):
+            return None, Followed.nothing()
     with_lines = options.lines and len(segments.index) > 0
     at_once = pool if with_lines and not searched else None
     lines_followed = beside(at_once, partial(follow_lines, track_map, before, data, segments))
     planes_found = beside(pool if data.frame.depth is not None else None, lambda: data.planes)
-    with watch("points"):
-        tracks = tracks.take(track_map.points.state[tracks.index] != DEAD)
-        if options.points:
-            tracks = follow_points(
-                track_map, camera, tracks, before.gray, data.gray, predicted, previous, POINT_TRACKS.max_shift
-            )
+    tracks = carry_on(tracks) if options.points else tracks
     alive = track_map.points.alive[tracks.index]
     with watch("depth"):
         measured = measure_points(track_map, data, predicted, tracks.take(alive))

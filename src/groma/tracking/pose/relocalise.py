@@ -321,10 +321,10 @@ class PoseSearch:
 
 
 class PlacesOnly:
-    """Just the places of points, where an estimate wants a table of them."""
+    """Just the places of points, where an estimate wants a table of them, and which are in the map."""
 
-    def __init__(self, xyz: FloatArray) -> None:
-        self.xyz = xyz
+    def __init__(self, xyz: FloatArray, state: IntArray | None = None) -> None:
+        self.xyz, self.state = xyz, state
 
 
 def _temporary_points(known: KnownFeatures, pairs: IntArray, data: FrameFeatures):
