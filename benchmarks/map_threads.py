@@ -41,7 +41,7 @@ from pathlib import Path
 def run(images, model, threads):
     """Map, diagnose and write as the command does; return what was used until the beginning of each stage."""
     marks, waiting, schedule = [], {}, Schedule()
-    gc.set_threshold(50_000)  # as the command does
+    gc.set_threshold(200_000)  # as the command does
 
     def mark(stage, *_):
         if not marks or marks[-1]["stage"] != stage:
@@ -93,7 +93,7 @@ class Schedule:
     def __init__(self):
         #: Seconds at which the first is now, and at which the second is free.
         self.now = self.free = 0.0
-        #: Seconds of what the second could do, and, within what is begun, of what has threads of its own.
+        #: Seconds of what the second could do, and, within what is begun, of what threads share.
         self.shared = self._divided = 0.0
         self._clock, self._inside = time.thread_time(), False
 
@@ -119,10 +119,7 @@ class Schedule:
             def work(piece, items):
                 return share(workers, piece, len(items), alone)
 
-            begin = time.thread_time()
-            result = work(function, range(tasks)) if alone else self._pieces(work, function, range(tasks))
-            self._divided += time.thread_time() - begin if self._inside and tasks > 1 and not alone else 0.0
-            return result
+            return work(function, range(tasks)) if alone else self._pieces(work, function, range(tasks))
 
         setattr(Workers, "map", of_workers)  # noqa: B010 - another signature
 
@@ -135,8 +132,11 @@ class Schedule:
         def ask():
             self._go_on()
             if not self._inside:
-                left = min(begin + seconds - self.now, seconds)
-                self.now += max(left, 0.0) * share  # the first one helps where it has threads of its own
+                if begin > self.now:  # the first one does it, and the second does not
+                    self.now, self.free = self.now + seconds, self.free - seconds
+                else:  # the first one helps where it is divided
+                    left = max(begin + seconds - self.now, 0.0)
+                    self.now, self.free = self.now + left * share, self.free - left * (1.0 - share)
             return result
 
         return cache(ask)
@@ -158,8 +158,13 @@ class Schedule:
 
     def _pieces(self, work, function, items, *more):
         """Do pieces of work that two would share."""
-        if self._inside or len(items) < 2:
+        if len(items) < 2:
             return work(function, items, *more)
+        if self._inside:
+            begin, divided = time.thread_time(), self._divided
+            result = work(function, items, *more)
+            self._divided = divided + time.thread_time() - begin  # pieces of pieces are in it
+            return result
         self._go_on()
         begin, second = self.now, max(self.now, self.free)
         ends = [begin, second]

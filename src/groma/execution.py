@@ -279,8 +279,9 @@ def together(*functions: Callable[[], Any]) -> tuple[Any, ...]:
 def begin(function: Callable[[], _Result]) -> Callable[[], _Result]:
     """Start a function in a thread of this process; return a callable that gives its result.
 
-    If no thread has started it when the result is asked for, or without workers, the caller runs it. The function must
-    have no side effects: if the work in between fails, nobody waits for it.
+    If no thread has started it when the result is asked for, or without workers, the caller runs it. Threads that are
+    free share what the function divides. It must have no side effects: if the work in between fails, nobody waits for
+    it.
 
     Examples
     --------
@@ -291,10 +292,15 @@ def begin(function: Callable[[], _Result]) -> Callable[[], _Result]:
     45
     """
     crew = _CREW.get()
-    executor = None if crew is None else crew.here.executor
-    if executor is None:
+    here = None if crew is None else crew.here
+    if here is None or here.executor is None:
         return cache(function)
-    future = executor.submit(function)
+
+    def work() -> _Result:
+        with _set(here):
+            return function()
+
+    future = here.executor.submit(work)
     return cache(lambda: function() if future.cancel() else future.result())
 
 

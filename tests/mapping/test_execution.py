@@ -149,6 +149,12 @@ def test_what_was_begun_goes_on_in_a_thread_and_is_done_once():
             begin(lambda: 1 // 0)()
 
 
+def test_threads_share_what_was_begun_and_is_divided():
+    met = threading.Barrier(2, timeout=30.0)
+    with work_with(3):  # neither piece gets past it without the other
+        assert len(begin(lambda: map_work(lambda _: met.wait(), range(2)))()) == 2
+
+
 def test_what_no_thread_has_begun_is_done_by_who_asks():
     free, place = threading.Event(), []
     with work_with(2):

@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from groma.adjustment.survey.gross_errors import reliability_of
 from groma.adjustment.survey.protocol import protocol
 from groma.adjustment.uncertainty import pose_uncertainty
 from groma.bounded.json_text import json_text
-from groma.execution import beside
+from groma.execution import begin, beside
 from groma.io import atomic_output, write_geometry, write_scene
 from groma.mapping.depth.points import MeasuredDepths
 from groma.mapping.lines.confidence import line_confidence
@@ -78,7 +78,11 @@ class MapResult:
     depths: MeasuredDepths | None = None
 
     def diagnose(self) -> Diagnosis:
-        """Say in words what the observations determine, at the noise and with the loss of the last adjustment."""
+        """Say in words what the observations determine, at the noise and with the loss of the last adjustment.
+
+        How well the cameras are known, of which :meth:`summary` tells, is found out meanwhile.
+        """
+        _ = self._uncertainty
         found = diagnose_scene(self.scene, problem=_problem_of(self.scene, self.adjusted_with))
         missing = self.num_photographs - self.scene.num_images
         if 2 * missing <= self.num_photographs:
@@ -93,6 +97,13 @@ class MapResult:
 
     def pose_uncertainty(self) -> dict[str, Any] | None:
         """Return how well the cameras are known, by leaving out one landmark after the other."""
+        return self._uncertainty()
+
+    @cached_property
+    def _uncertainty(self) -> Callable[[], dict[str, Any] | None]:
+        return begin(self._pose_uncertainty)
+
+    def _pose_uncertainty(self) -> dict[str, Any] | None:
         problem = _problem_of(self.adjusted, self.adjusted_with)
         return pose_uncertainty(self.adjusted, problem, self.report.sigma0 or 1.0, by_landmarks=True)
 

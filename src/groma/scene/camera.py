@@ -78,8 +78,9 @@ class Cameras(Table, noun="camera"):
 
     def rows_by_model(self, camera_idx: IntArray) -> Iterator[tuple[camera_models.CameraModel, IntArray, FloatArray]]:
         """Yield (model, rows (n,) of ``camera_idx`` of its cameras, their parameters (n, k)) for each camera model."""
-        for name, members in self.by_model().items():
-            rows = np.flatnonzero(np.isin(camera_idx, members))
+        models = np.array(self.models, dtype=object)
+        for name in dict.fromkeys(self.models):
+            rows = np.flatnonzero((models == name)[camera_idx])
             if len(rows):
                 model = camera_models.model(name)
                 yield model, rows, np.ascontiguousarray(self.params[camera_idx[rows], : model.num_parameters])

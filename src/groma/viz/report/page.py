@@ -150,6 +150,7 @@ def write_report(
     photographs = said.photographs or page_photographs(scene_after, images)
     states[-1] = replace(after, up=up_in_page(scene_after, photographs))
     of_scene = begin(partial(scene_data, scenes, states, held, said.covariances))
+    of_images = begin(partial(image_data, scene_after, held, states, photographs))
     parts = {
         "POLICY": _policy(script),
         "STYLE": _part("page.css"),
@@ -164,7 +165,7 @@ def write_report(
         ),
         "TABLES": _page_tables.number_tables(scene_after, before, after, numbers),
         "FOOTER": f"Written by groma {__version__}. Pixels: the centre of the first pixel is (0.5, 0.5).",
-        "DATA": script_json(of_scene() | image_data(scene_after, held, states, photographs)),
+        "DATA": script_json(of_scene() | of_images()),
         "SCRIPT": script,
     }
     page = re.sub(r"\{\{([A-Z]+)\}\}", lambda match: parts[match[1]], _part("page.html"))

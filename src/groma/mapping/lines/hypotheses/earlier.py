@@ -16,6 +16,7 @@ import numpy as np
 
 from groma import cameras as camera_models
 from groma._typing import FloatArray, IntArray
+from groma.execution import map_in_threads
 from groma.gates import gate
 from groma.mapping.groups import grouped
 from groma.mapping.lines.line_map import LineMap
@@ -68,15 +69,17 @@ class EarlierMap:
         """Return what is known of each image, at the poses of the scene."""
         table = self.scene.point_observations
         order, bounds = grouped(table.image_idx, scene.num_images)
-        found = []
-        for i, others in enumerate(neighbors):
+
+        def known_of(i: int) -> Known:
+            others = neighbors[i]
             place = {int(j): slot for slot, j in enumerate(self.lines.neighbors[i])}
             slots = np.array([place.get(int(j), -1) for j in others], np.int64)
             supporters = self.lines.supporters[views.rows(i)][:, slots].astype(np.int64)
             seen = self.scene.points.xyz[table.point_idx[order[bounds[i] : bounds[i + 1]]]]
             moved = bool((slots < 0).any() or (_moved_px(self.scene, scene, views, i, others, seen) > noise).any())
-            found.append(Known(np.where(slots >= 0, supporters, -1), self.lines.rejection[views.rows(i)], moved))
-        return found
+            return Known(np.where(slots >= 0, supporters, -1), self.lines.rejection[views.rows(i)], moved)
+
+        return map_in_threads(known_of, range(len(neighbors)))
 
 
 def _moved_px(

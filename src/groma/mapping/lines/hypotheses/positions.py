@@ -16,7 +16,7 @@ import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
-from groma.execution import map_largest_first, map_work, num_calls
+from groma.execution import map_in_threads, map_largest_first, map_work, num_calls
 from groma.features.matches import LineMatches
 from groma.mapping.groups import distinct_pairs, grouped
 from groma.mapping.lines.clusters import Cluster, clusters
@@ -242,10 +242,11 @@ def _points_by_image(scene: Scene, views: LineViews) -> list[tuple[FloatArray, F
     """Pixels and inverse depths of the points seen in each image."""
     observations = scene.point_observations
     order, bounds = grouped(observations.image_idx, scene.num_images)
-    near = []
-    for i in range(scene.num_images):
+
+    def near(i: int) -> tuple[FloatArray, FloatArray]:
         xyz = scene.points.xyz[observations.point_idx[order[bounds[i] : bounds[i + 1]]]]
         x = xyz @ views.camera[i, :, :3].T + views.camera[i, :, 3]
         x = x[x[:, 2] > 0.0]
-        near.append((x[:, :2] / x[:, 2:], 1.0 / x[:, 2]))
-    return near
+        return x[:, :2] / x[:, 2:], 1.0 / x[:, 2]
+
+    return map_in_threads(near, range(scene.num_images))

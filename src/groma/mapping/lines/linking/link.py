@@ -117,7 +117,8 @@ def link(
     members, representative : (m,) int
         Rows of the segments in groups of two and more, and the row that stands for each one's group.
     """
-    edges = positions.edges[free[positions.edges].all(axis=1)]
+    first, second = positions.edges.T
+    edges = positions.edges[free[first] & free[second]]
     tables = (
         views.camera, views.center, views.image_idx, views.ray, positions.q, positions.covariance, sigma, views.line,
         views.ends,
@@ -129,7 +130,7 @@ def link(
 
     map_ranges(compare, len(edges), _EDGES_AT_ONCE)
     edges = edges[agree]
-    edges = edges[np.argsort(-rank[edges].min(1), kind="stable")]
+    edges = edges[np.argsort(-np.minimum(*rank[edges.T]), kind="stable")]
     parent = np.arange(len(free))
     _join(edges, *tables, max_squared, np.empty(len(edges), bool), rank, parent)
     size = np.bincount(parent, minlength=len(parent))

@@ -23,7 +23,7 @@ from functools import partial
 import numpy as np
 
 from groma._numba import loop
-from groma._rows import numbered, pointers_of
+from groma._rows import numbered, pointers_of, sorted_within
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.batch_least_squares import Observations, solve_batch
 from groma.estimators.two_point_line import TWO_POINT_LINE
@@ -213,7 +213,7 @@ def _pixel_size(tracks: Tracks) -> FloatArray:
     axis = views.camera[:, 2][image]
     depth = np.einsum("mc,mc->m", axis[:, :3], tracks.lines.mean(1)[line]) + axis[:, 3]
     size = np.abs(depth) / focal[image]
-    order = np.lexsort([size, line])
+    order = sorted_within(size, line, tracks.num_lines)
     pointers = pointers_of(np.bincount(line, minlength=tracks.num_lines))
     middle = (pointers[:-1] + pointers[1:]) // 2
     return size[order][np.minimum(middle, len(rows) - 1)]

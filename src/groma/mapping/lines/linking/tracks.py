@@ -13,7 +13,7 @@ import numpy as np
 from groma._rows import pointers_of
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.line_ends import SegmentRays, trim
-from groma.execution import map_ranges
+from groma.execution import map_in_threads, map_ranges
 from groma.gates import LINE_MAPS, gate
 from groma.mapping.groups import grouped
 from groma.mapping.lines.gates import AGREEMENT
@@ -107,13 +107,15 @@ class Tracks:
     def lines_near_images(self, neighbors: list[IntArray]) -> list[IntArray]:
         """Lines to look for in each image: those seen in it or in a neighbour."""
         rows, line = self.members()
-        begin, near, looked_for = np.searchsorted(rows, self.views.pointers), [], np.zeros(self.num_lines, bool)
-        for i, row in enumerate(neighbors):
-            looked_for[:] = False
-            for j in (i, *row):
+        begin = np.searchsorted(rows, self.views.pointers).tolist()
+
+        def near(i: int) -> IntArray:
+            looked_for = np.zeros(self.num_lines, bool)
+            for j in (i, *neighbors[i].tolist()):
                 looked_for[line[begin[j] : begin[j + 1]]] = True
-            near.append(np.flatnonzero(looked_for))
-        return near
+            return np.flatnonzero(looked_for)
+
+        return map_in_threads(near, range(len(neighbors)))
 
     def direction(self) -> FloatArray:
         """(L,) +1 or -1: whether most observations run from the first end point to the second in the image."""
