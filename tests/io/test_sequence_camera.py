@@ -289,3 +289,8 @@ def test_masks_come_with_the_frames(tmp_path):
         np.testing.assert_array_equal(frame.used[:, [20, 31, 34, 44]], [[False, False, True, True]] * SIZE[1])
     with pytest.raises(InputError, match="Cannot read"):
         open_sequence(tmp_path / "images", masks=tmp_path / "none", camera="50 50 32 24")
+    writer = cv2.VideoWriter(str(tmp_path / "v.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 20.0, SIZE)
+    writer.write(np.zeros((*SIZE[::-1], 3), np.uint8))
+    writer.release()
+    with pytest.raises(InputError, match="Masks are for sequences of image files"):
+        open_sequence(tmp_path / "v.avi", camera="50 50 32 24", masks=tmp_path / "masks")
