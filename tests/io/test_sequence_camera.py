@@ -4,7 +4,7 @@
 import cv2
 import numpy as np
 import pytest
-from _sequences import POINTS, blob_center, blob_image
+from _sequences import POINTS, SIZE, blob_center, blob_image, image
 
 from groma import cameras
 from groma.errors import InputError
@@ -270,3 +270,27 @@ def test_depth_is_undistorted_with_the_image(tum):
     assert inside.mean() > 0.9
     assert np.abs(frame.depth[inside] - frame.gray[inside]).max() <= 1.0
     assert (frame.depth != ramp / 100).any()
+
+
+def test_masks_come_with_the_frames(tmp_path):
+    """A mask for each image that has one, or one for all; undistorted as the images are."""
+    for number in (1, 2):
+        image(tmp_path / "images" / f"{number}.png", number)
+    right = np.zeros(SIZE[::-1], np.uint8)
+    right[:, SIZE[0] // 2 :] = 255
+    (tmp_path / "masks").mkdir()
+    cv2.imwrite(str(tmp_path / "masks" / "2.png"), right)
+    given = {"masks": tmp_path / "masks", "camera": "50 50 32 24"}
+    first, second = open_sequence(tmp_path / "images", **given)
+    assert first.used is None
+    np.testing.assert_array_equal(second.used, right > 0)
+    given = {"masks": tmp_path / "masks" / "2.png", "camera": "50 50 32 24 -0.3 0.1 0 0"}
+    for frame in open_sequence(tmp_path / "images", **given):
+        np.testing.assert_array_equal(frame.used[:, [20, 31, 34, 44]], [[False, False, True, True]] * SIZE[1])
+    with pytest.raises(InputError, match="Cannot read"):
+        open_sequence(tmp_path / "images", masks=tmp_path / "none", camera="50 50 32 24")
+    writer = cv2.VideoWriter(str(tmp_path / "v.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 20.0, SIZE)
+    writer.write(np.zeros((*SIZE[::-1], 3), np.uint8))
+    writer.release()
+    with pytest.raises(InputError, match="Masks are for sequences of image files"):
+        open_sequence(tmp_path / "v.avi", camera="50 50 32 24", masks=tmp_path / "masks")

@@ -371,25 +371,6 @@ def test_images_of_more_than_8_bits(tmp_path, levels, expected):
     assert values(open_sequence(tmp_path, camera="50 50 32 24"))[0] == 7
 
 
-def test_masks_come_with_the_frames(tmp_path):
-    """A mask for each image that has one, or one for all; undistorted as the images are."""
-    for number in (1, 2):
-        image(tmp_path / "images" / f"{number}.png", number)
-    right = np.zeros(SIZE[::-1], np.uint8)
-    right[:, SIZE[0] // 2 :] = 255
-    (tmp_path / "masks").mkdir()
-    cv2.imwrite(str(tmp_path / "masks" / "2.png"), right)
-    given = {"masks": tmp_path / "masks", "camera": "50 50 32 24"}
-    first, second = open_sequence(tmp_path / "images", **given)
-    assert first.used is None
-    np.testing.assert_array_equal(second.used, right > 0)
-    given = {"masks": tmp_path / "masks" / "2.png", "camera": "50 50 32 24 -0.3 0.1 0 0"}
-    for frame in open_sequence(tmp_path / "images", **given):
-        np.testing.assert_array_equal(frame.used[:, [20, 31, 34, 44]], [[False, False, True, True]] * SIZE[1])
-    with pytest.raises(InputError, match="Cannot read"):
-        open_sequence(tmp_path / "images", masks=tmp_path / "none", camera="50 50 32 24")
-
-
 def test_times_from_names(tmp_path):
     for name in ("1.50", "1.25"):
         image(tmp_path / "a" / f"{name}.png", 1)
@@ -422,8 +403,6 @@ def test_video(tmp_path):
         open_sequence(tmp_path / "broken.mp4", camera="50 50 32 24")
     with pytest.raises(InputError, match="No camera"):
         open_sequence(path)
-    with pytest.raises(InputError, match="Masks are for sequences of image files"):
-        open_sequence(path, camera="50 50 32 24", masks=tmp_path)
 
 
 def test_what_is_no_sequence(tmp_path):

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
+from worlds import QUERIES, cabinet_in
 
 from groma.cli.main import run
 from groma.errors import InputError
@@ -17,8 +18,6 @@ from groma.execution import work_with
 from groma.features.contract import ImageRetrieval
 from groma.geometry import quaternion, so3
 from groma.io import read_scene, write_scene
-from groma.io.colmap.masks import Masks
-from groma.localization import localizer as localizer_module
 from groma.localization.features import find_corners, find_points, mirrored, unit
 from groma.localization.localizer import LocalizeOptions, Localizer, check_photographs
 from groma.localization.map_index import read_index
@@ -30,24 +29,11 @@ from groma.localization.pose.verdict import Verdict, doubted_if_mirrored
 from groma.localization.retrieval import VladRetrieval
 from groma.localization.run import localize_images, query_files
 
-#: Images around one corner of the cabinet; every third is a query.
-FRAMES = [f"{number:04d}.jpg" for number in range(24, 39)]
-QUERIES = FRAMES[1::3]
-
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
     """A folder with a map of some frames, their images, and the others as queries."""
-    folder = tmp_path_factory.mktemp("cabinet")
-    scene = read_scene(cabinet.folder() / "model")
-    names = list(scene.images.names)
-    rows = [names.index(name) for name in FRAMES if name not in QUERIES]
-    write_scene(scene.subset(rows), folder / "map.npz")
-    for kind, chosen in (("images", [name for name in FRAMES if name not in QUERIES]), ("queries", QUERIES)):
-        (folder / kind).mkdir()
-        for name in chosen:
-            shutil.copy(cabinet.folder() / "images" / name, folder / kind / name)
-    return folder
+    return cabinet_in(tmp_path_factory.mktemp("cabinet"))
 
 
 @pytest.fixture(scope="module")
@@ -208,37 +194,6 @@ def test_a_photograph_of_which_one_part_shows_the_place_is_doubted(place, locali
     pieced = other.copy()
     pieced[160:320, 160:480] = image[160:320, 160:480]
     assert localizer.localize(pieced).pose.status != "localized"
-
-
-def test_what_a_mask_hides_is_neither_used_nor_missing(place, localizer, tmp_path, monkeypatch):
-    """The left half is of another photograph, as a person in front of the camera; the mask of the file hides it."""
-    image, other = (
-        cv2.imread(str(place / "queries" / name), cv2.IMREAD_GRAYSCALE) for name in (QUERIES[3], QUERIES[0])
-    )
-    image[:, :320] = other[:, :320]
-    used = np.zeros(image.shape, bool)
-    used[:, 320:] = True
-    for name, picture in (("a.png", image), ("a_mask.png", 255 * used.astype(np.uint8))):
-        cv2.imwrite(str(tmp_path / name), picture)
-    files = query_files([tmp_path])
-    assert list(files) == ["a.png"]
-    plain, masked = (
-        localize_images(localizer, files, tmp_path / "work", masks=masks)[0]
-        for masks in (None, Masks.of(tmp_path, list(files)))
-    )
-    assert (plain.status, masked.status) == ("uncertain", "localized")
-    assert (masked.pixel[:, 0] > 320.0).all() and (masked.segment[:, ::2] > 320.0).all()
-    truth = read_scene(cabinet.folder() / "model")
-    shown = []
-    ask = localizer_module.shown_of
-    monkeypatch.setattr(localizer_module, "shown_of", lambda *given: shown.append(ask(*given)) or shown[-1])
-    found = localizer.localize(image, used=used).pose
-    assert shown and all(one.missing == 0.0 for one in shown)
-    assert np.array_equal(found.cam_from_world, masked.pose)
-    distance, angle = _errors(found, truth, QUERIES[3])
-    assert angle < 4.0, distance
-    with pytest.raises(InputError, match=r"used must have the shape of the image, \(480, 640\); got \(2, 2\)"):
-        localizer.localize(image, used=np.ones((2, 2), bool))
 
 
 def test_the_mirror_image_of_descriptors_is_that_of_the_image(place):

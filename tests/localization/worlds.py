@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A camera in a room of points and lines, and exact matches of it."""
 
+import shutil
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from groma.evaluation import cabinet
 from groma.geometry import quaternion, so3
+from groma.io import read_scene, write_scene
 from groma.localization.pose.absolute_pose import estimate_absolute_pose
 from groma.localization.pose.camera import QueryCamera
 
@@ -59,3 +63,21 @@ def pose_of(world, kinds, camera=CAMERA, **options):
     points = (world.points2d, world.points3d) if "points" in kinds else (None, None)
     lines = (world.segments2d, world.segments3d) if "lines" in kinds else (None, None)
     return estimate_absolute_pose(camera, *points, *lines, **options)
+
+
+#: Images around one corner of the cabinet; every third is a query.
+FRAMES = [f"{number:04d}.jpg" for number in range(24, 39)]
+QUERIES = FRAMES[1::3]
+
+
+def cabinet_in(folder: Path) -> Path:
+    """Write to a folder a map of some frames of the cabinet, by motion capture, their images, and the others."""
+    scene = read_scene(cabinet.folder() / "model")
+    names = list(scene.images.names)
+    rows = [names.index(name) for name in FRAMES if name not in QUERIES]
+    write_scene(scene.subset(rows), folder / "map.npz")
+    for kind, chosen in (("images", [name for name in FRAMES if name not in QUERIES]), ("queries", QUERIES)):
+        (folder / kind).mkdir()
+        for name in chosen:
+            shutil.copy(cabinet.folder() / "images" / name, folder / kind / name)
+    return folder

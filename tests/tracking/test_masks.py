@@ -26,7 +26,9 @@ def frames():
     board = board[: _room.HEIGHT, : _room.WIDTH].astype(np.uint8)
     return [
         dataclasses.replace(
-            frame, gray=np.where(USED, frame.gray, board), depth=np.where(USED, frame.depth, np.float32(0.5))
+            frame,
+            gray=np.where(USED, frame.gray, board),
+            depth=np.where(USED, np.asarray(frame.depth), np.float32(0.5)),
         )
         for frame in _room.frames("rgbd", _room.poses(8))
     ]

@@ -179,7 +179,7 @@ def find_features(
     points, found = together(lambda: find_points(image).joined(find_corners(image)), segments)
     if used is not None:
         points = points.take(is_used(used, points.pixels))
-    return DescribedImage(points, *found, used)
+    return DescribedImage(points, *found, used=used)
 
 
 def _segments(image: GrayImage, camera: QueryCamera, detector: SegmentDetector) -> Segments:
