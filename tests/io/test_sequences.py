@@ -63,27 +63,6 @@ def test_associations_in_either_order(tum):
         open_sequence(tum)
 
 
-def test_intrinsics_of_the_benchmark(tum, tmp_path):
-    (tum / "camera.txt").unlink()
-    with pytest.raises(InputError, match="Pass one"):
-        open_sequence(tum)
-    named = tmp_path / "rgbd_dataset_freiburg3_walk"
-    for row in range(2):
-        image(named / f"rgb/{row}.png", row, (640, 480))
-    (named / "rgb.txt").write_text("0.0 rgb/0.png\n0.1 rgb/1.png\n")
-    sequence = open_sequence(named)
-    assert sequence.kind == "mono"
-    np.testing.assert_allclose(sequence.camera.params, [535.4, 539.2, 320.6, 248.1])
-    named.rename(tmp_path / "freiburg1_xyz")
-    np.testing.assert_allclose(open_sequence(tmp_path / "freiburg1_xyz").camera.params, [517.3, 516.5, 319.1, 255.8])
-    (tmp_path / "freiburg1_xyz").rename(tmp_path / "data")
-    with pytest.raises(InputError, match="neither its name nor the first lines of its files say"):
-        open_sequence(tmp_path / "data")
-    said = "# color images\n# file: 'rgbd_dataset_freiburg2_desk.bag'\n"
-    (tmp_path / "data" / "rgb.txt").write_text(said + (tmp_path / "data" / "rgb.txt").read_text())
-    np.testing.assert_allclose(open_sequence(tmp_path / "data").camera.params[:2], [520.9, 521.0])
-
-
 def test_faults(tum):
     lines = (tum / "rgb.txt").read_text().splitlines()
     # Out of order, a missing file, a repeated time.
@@ -145,38 +124,6 @@ def test_kitti(kitti):
     ]
     mono = open_sequence(kitti, kind="mono")
     assert (mono.kind, mono.camera.baseline, next(iter(mono)).right) == ("mono", None, None)
-
-
-def test_stereo_pairs_of_any_camera(kitti, tmp_path):
-    """In left and right, with a calibration as of KITTI; paired by name, or by number."""
-    expected = [(f.timestamp, int(f.gray[0, 0]), int(f.right[0, 0])) for f in open_sequence(kitti)]
-    for place, names in enumerate((("left", "right"), ("Left", "Right"))):
-        for side, name in enumerate(names):
-            (kitti / (f"image_{side}" if place == 0 else ("left", "right")[side])).rename(kitti / name)
-        sequence = open_sequence(kitti)
-        assert (sequence.kind, sequence.camera.baseline) == ("stereo", 0.5)
-        assert [(f.timestamp, int(f.gray[0, 0]), int(f.right[0, 0])) for f in sequence] == expected
-        for name in names:  # ..., 2 and 10, whose order is that of numbers
-            for row, path in enumerate(sorted((kitti / name).iterdir())):
-                path.rename(path.with_name(f"{name}_{(1, 2, 10)[row]}.png"))
-    (kitti / "Right" / "Right_2.png").unlink()
-    sequence = open_sequence(kitti)
-    assert [frame.right is None for frame in sequence] == [False, True, False]
-    assert sequence.warnings == ["Left_2.png has no right image."]
-    mono = open_sequence(kitti, kind="mono", camera="70 70 30 20")
-    assert (mono.kind, mono.camera.baseline, next(iter(mono)).right) == ("mono", None, None)
-    for damaged in (
-        "P0: 70 0 30 0 0 70 20 0 0 0 1 0\n",
-        "P0: 70 0 30 0 0 70 20 0 0 0 1 0\nP1: 70 0 30 9 0 70 20 0 0 0 1 0\n",
-    ):
-        (kitti / "calib.txt").write_text(damaged)
-        with pytest.raises(InputError, match=r"does not say how the cameras lie. Write it: 'P0: f 0 cx .* --kind mono"):
-            open_sequence(kitti)
-    (kitti / "calib.txt").write_text("P0: 70 0 30 0 0 70 20 0 0 0 1 0\nP1: 70 0 30 -35 0 70 20 0 0 0 1 0\n")
-    for number, path in enumerate((kitti / "Right").iterdir()):
-        path.rename(path.with_name(f"{number + 50}.png"))
-    with pytest.raises(InputError, match=r"No image of the left camera, such as Left_1.png, has the name or number"):
-        open_sequence(kitti)
 
 
 def test_kitti_with_dropped_images(kitti):

@@ -54,10 +54,3 @@ def write_pictures(folder, *names):
     for name in names:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(folder / name), np.full((480, 640), 90, np.uint8))
-
-
-def write_on_its_side(path, picture) -> None:
-    """Write a JPEG file whose EXIF says that a quarter turn to the right shows it upright."""
-    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
-    content = cv2.imencode(".jpg", picture)[1].tobytes()
-    path.write_bytes(content[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + content[2:])

@@ -8,12 +8,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from _pages import data_of, write_on_its_side, write_page
+from _pages import data_of, write_page
 from _scene import exact_scene
 
 from groma.cli.main import run
 from groma.errors import InputError, OutputError
-from groma.geometry import se3
 from groma.io import write_scene
 from groma.scene import Directions, Planes, Relations, Scene
 from groma.scene.synthetic.scenes import holistic
@@ -130,18 +129,6 @@ def test_images_are_embedded(tmp_path):
     entries = data_of(write_page(tmp_path, None, exact_scene(), images=images))["images"]
     assert entries[0]["photo"].startswith("data:image/jpeg;base64,")
     assert entries[1]["photo"] == ""
-
-
-def test_photographs_taken_on_their_side_are_shown_upright(tmp_path):
-    """What is up in the scene follows: the left of the photographs, as they are stored."""
-    scene = exact_scene()
-    for name in scene.images.names:
-        write_on_its_side(tmp_path / name, np.full((480, 640, 3), 128, np.uint8))
-    data = data_of(write_page(tmp_path, None, scene, images=tmp_path))
-    assert [entry["turn"] for entry in data["images"]] == [1, 1]
-    left = -se3.to_matrix(scene.cam_from_world)[:, 0, :3].sum(axis=0)
-    np.testing.assert_allclose(data["view"]["up"], left / np.linalg.norm(left), atol=1e-12)
-    assert [entry["turn"] for entry in data_of(write_page(tmp_path, None, scene))["images"]] == [0, 0]
 
 
 def test_segments_in_the_images(tmp_path):

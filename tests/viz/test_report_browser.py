@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from _pages import write_on_its_side
 from _scene import exact_scene, localized_photograph, random_covariances
 
 from groma.localization.result import card_of
@@ -152,35 +151,6 @@ def test_a_segment_clicked_in_a_photograph_lights_up_in_the_scene(opened, scene)
     assert page.evaluate("pieceEnds(piecesOf(chosen.index)[0])") == [
         pytest.approx(_in_page(page, end), abs=1e-5) for end in scene.lines.segments[line]
     ]
-
-
-def test_a_photograph_taken_on_its_side_is_shown_upright(opened, scene, tmp_path):
-    """Its left, dark half is on top, in the strip too, and its segments are clicked where they are shown."""
-    picture = np.full((480, 640, 3), 255, np.uint8)
-    picture[:, :320] = 0
-    for name in scene.images.names:
-        write_on_its_side(tmp_path / name, picture)
-    write_report(tmp_path / "page.html", None, scene, images=tmp_path)
-    page = opened(viewport={"width": 1300, "height": 1600})
-    page.goto((tmp_path / "page.html").as_uri())
-    page.wait_for_function("() => blend === target && pictureOf(0) && thumbs.every(t => t.bitmap)")
-    page.select_option("#image", "0")
-    page.evaluate(
-        "() => { for (const name of ['segments', 'projected', 'points']) layers[name] = false; drawImage(); }"
-    )
-    for one in ("sheet", "thumbs[0].one.firstChild"):
-        grey = f"v => {one}.getContext('2d').getImageData({one}.width / 2, v * {one}.height, 1, 1).data[0]"
-        assert page.evaluate(grey, 0.2) < 60 and page.evaluate(grey, 0.8) > 200
-    page.evaluate("() => { layers.segments = true; drawImage(); }")
-    line, (u, v) = (
-        int(scene.line_observations.line_idx[1]),
-        scene.line_observations.segment[1].reshape(2, 2).mean(axis=0),
-    )
-    box = page.locator("#photo").bounding_box()
-    scale = box["height"] / 640
-    x, y = box["width"] / 2 - (v - 240) * scale, u * scale
-    page.mouse.click(box["x"] + x, box["y"] + y)
-    assert page.evaluate("[chosen.kind, chosen.index]") == ["line", line]
 
 
 def test_points_planes_and_cameras_can_be_clicked(opened, scene):
