@@ -132,8 +132,10 @@ class Schedule:
         def ask():
             self._go_on()
             if not self._inside:
-                if begin > self.now:  # the first one does it, and the second does not
+                if begin > self.now:  # the first one does it; the second helps as soon as it is free
                     self.now, self.free = self.now + seconds, self.free - seconds
+                    saved = min(max(self.now - self.free, 0.0), 2.0 * seconds * (1.0 - share)) / 2.0
+                    self.now, self.free = self.now - saved, max(self.free, self.now - 2.0 * saved) + saved
                 else:  # the first one helps where it is divided
                     left = max(begin + seconds - self.now, 0.0)
                     self.now, self.free = self.now + left * share, self.free - left * (1.0 - share)

@@ -59,8 +59,6 @@ from groma.geometry.algebra import vectors
 BAND = PLANE_SEARCH.band
 #: Candidates whose scores are brought up to date together (cost: time only).
 _SCORED_TOGETHER = 16
-#: Failures in a row from which on the next candidate is grown ahead, as it will probably be needed (cost: time only).
-_AHEAD = 2
 #: Features that planes which are known already take out.
 _NONE = np.zeros(0, np.int64)
 
@@ -261,7 +259,7 @@ def _extract_of(
         queue.alive[best] = False
         grow = ahead.pop(best, partial(grower.grow, candidates[best], int(homes[best]), labels))
         ahead.clear()
-        if failures >= _AHEAD and (other := queue.best(stays=True)) is not None:
+        if (other := queue.best(stays=True)) is not None:  # it will probably be needed: nine in ten are no plane
             ahead[other] = begin(partial(grower.grow, candidates[other], int(homes[other]), labels))
         grown, plane, rows = grow()
         failures += 1

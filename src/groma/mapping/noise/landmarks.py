@@ -34,8 +34,8 @@ class LandmarkNoiseGates:
 
 
 GATES = LandmarkNoiseGates()
-#: Observed segments per task (cost: time only).
-_ROWS_AT_ONCE = 8192
+#: Observed segments per task, and lines whose noise it propagates (cost: time only).
+_ROWS_AT_ONCE, _LINES_AT_ONCE = 8192, 1024
 
 
 @dataclass(frozen=True)
@@ -78,14 +78,24 @@ class LineNoise:
         """Cross-covariance (N, 2, 2), along ``across``, of the points at two shares of the segments ``rows``."""
         first = np.stack([1.0 - first_share, first_share], axis=-1)
         second = np.stack([1.0 - second_share, second_share], axis=-1)
-        blocks = self.covariance[rows].reshape(-1, 2, 2, 2, 2)
-        return np.einsum("ne,neafb,nf->nab", first, blocks, second)
+        found = np.empty((len(rows), 2, 2))
+
+        def fill(part: slice) -> None:
+            blocks = self.covariance[rows[part]].reshape(-1, 2, 2, 2, 2)
+            np.einsum("ne,neafb,nf->nab", first[part], blocks, second[part], out=found[part])
+
+        map_ranges(fill, len(rows), _LINES_AT_ONCE)
+        return found
 
     def ends(self, rows: IntArray) -> FloatArray:
         """Covariances (N, 2, 3, 3) of the end points of some lines, with as much uncertainty along them as across."""
         blocks, across = self.covariance[rows].reshape(-1, 2, 2, 2, 2), self.across[rows]
-        blocks = np.stack([blocks[:, 0, :, 0], blocks[:, 1, :, 1]], axis=1)
-        full = np.einsum("lai,leab,lbj->leij", across, blocks, across)
+        blocks, full = np.stack([blocks[:, 0, :, 0], blocks[:, 1, :, 1]], axis=1), np.empty((len(rows), 2, 3, 3))
+
+        def fill(part: slice) -> None:
+            np.einsum("lai,leab,lbj->leij", across[part], blocks[part], across[part], out=full[part])
+
+        map_ranges(fill, len(rows), _LINES_AT_ONCE)
         along = cross(across[:, 0], across[:, 1])
         size = 0.5 * np.trace(blocks, axis1=2, axis2=3)
         return full + size[..., None, None] * (along[:, :, None] * along[:, None, :])[:, None]
