@@ -15,7 +15,8 @@ which most is on it then, by the same tests. Parallel planes that their own nois
 that they are parts of something rough. What is on one piece deviates alike, so the covariance of such a plane counts
 pieces, not features. Steps of a stepped wall are no pieces of one: the plane through them is turned against all of them
 alike, while the turns of pieces scatter around that of the whole. So the mean turn of the pieces has to be none, by
-their covariances, by how they scatter beyond these, and by that of the whole.
+their covariances, by how they scatter beyond these, and by that of the whole. A piece may have held landmarks of
+another plane, a panel before the wall: they are free again once it has become part of the wall.
 """
 
 from __future__ import annotations
