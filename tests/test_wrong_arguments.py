@@ -12,6 +12,7 @@ import groma
 from groma import io
 from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.errors import InputError
+from groma.evaluation import align_poses, score_poses
 from groma.geometry import line3, plane3, quaternion, se3, sim3
 from groma.mapping.lines.build import map_lines
 from groma.mapping.structure.find import find_structure
@@ -44,7 +45,7 @@ TAKE_SCENES = {
         writer.__name__: lambda scene, writer=writer: writer(scene, "a")
         for writer in (
             io.write_archive, io.write_bal, io.write_colmap, io.write_dxf, io.write_gltf, io.write_obj, io.write_ply,
-            io.write_recording, io.write_transforms,
+            io.write_recording, io.write_transforms, io.to_pycolmap,
         )
     },
 }  # fmt: skip
@@ -78,6 +79,10 @@ def test_a_path_or_a_result_is_no_scene(function, tmp_path, monkeypatch):
         (lambda: groma.adjust_surveyed(SCENE, options={}), "options must be an AdjustOptions; got dict"),  # type: ignore[arg-type]
         (lambda: groma.uncertainty(SCENE, groma.AdjustOptions()), "must be an AssemblyOptions; got AdjustOptions"),  # type: ignore[arg-type]
         (lambda: groma.diagnose(SCENE, groma.AdjustOptions()), "must be an AssemblyOptions; got AdjustOptions"),  # type: ignore[arg-type]
+        (lambda: map_lines(SCENE, SCENE), "segments must be a Sequence; got Scene"),  # type: ignore[arg-type]
+        (lambda: groma.adjust_parts("part.npz", "out"), r"parts must be a list or tuple; got str\. Pass the paths"),
+        (lambda: align_poses("a.txt", "b.txt"), "source must be an array of real numbers; got str"),
+        (lambda: score_poses({}, {}), "estimated must be an array of real numbers; got dict"),  # type: ignore[arg-type]
         (lambda: groma.cameras.model(1), "name must be a str; got int"),  # type: ignore[arg-type]
         (lambda: holistic(4, noise_px=float("nan")), "noise_px must be a standard deviation, 0 or more; got nan"),
         (lambda: holistic(4, structure=-1.0), "structure must be a standard deviation, 0 or more; got -1"),

@@ -12,7 +12,7 @@ from groma._typing import FloatArray
 from groma.errors import InputError, ShapeError
 from groma.evaluation.gates import SCORES
 from groma.geometry import quaternion, so3
-from groma.geometry.algebra import finite_rows
+from groma.geometry.algebra import finite_rows, numbers
 from groma.scene import Similarity
 
 #: Second singular value of the centred points, relative to the first, below which they count as collinear.
@@ -118,7 +118,7 @@ def pose_alignment(source: npt.ArrayLike, target: npt.ArrayLike, with_scale: boo
     With fewer than three centres, or all on one line, the orientations alone give the rotation. Parameters and errors
     are those of :func:`align_poses`.
     """
-    from_source, from_target = np.asarray(source, float), np.asarray(target, float)
+    from_source, from_target = numbers(source, "source"), numbers(target, "target")
     if from_source.shape != from_target.shape or from_source.ndim != 2 or from_source.shape[1] != 7:
         raise ShapeError(f"Poses must have shape (N, 7), twice; got {from_source.shape} and {from_target.shape}.")
     if len(from_source) == 0:

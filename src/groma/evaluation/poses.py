@@ -16,6 +16,7 @@ from groma.evaluation.alignment import align_poses, camera_centers
 from groma.evaluation.gates import SCORES
 from groma.gates import NORMAL
 from groma.geometry import quaternion
+from groma.geometry.algebra import numbers
 from groma.scene import Scene, Similarity
 from groma.scene.checks import check_scene_given
 
@@ -128,7 +129,7 @@ def score_poses(
     InputError
         If there is no pose.
     """
-    estimate, reference = np.asarray(estimated, float), np.asarray(true, float)
+    estimate, reference = numbers(estimated, "estimated"), numbers(true, "true")
     alignment = align_poses(estimate, reference, with_scale)
     moved = alignment.poses(estimate)
     distance = np.linalg.norm(camera_centers(moved) - camera_centers(reference), axis=1)

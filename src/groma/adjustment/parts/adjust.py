@@ -28,7 +28,7 @@ from groma.adjustment.parts.memory import room_for_parts
 from groma.adjustment.parts.opened import open_parts
 from groma.adjustment.parts.run import Run, Solved, Squares, Written
 from groma.adjustment.report import AdjustReport, not_converged
-from groma.errors import InputError, OutputError, given_or_default
+from groma.errors import InputError, OutputError, check_kind, given_or_default
 from groma.factors.losses import Loss, Trivial
 from groma.solver.linear.blas import one_blas_thread
 from groma.solver.options import SolverOptions
@@ -99,6 +99,7 @@ def adjust_parts(
     OutputError
         If archives exist in ``output`` already, or cannot be written.
     """
+    check_kind(parts, (list, tuple), "parts", "Pass the paths of the archives: [path, ...].")
     reducer, options = reducer or SingleProcess(), given_or_default(options, SolverOptions)
     chosen = AssemblyOptions(**assembly)  # type: ignore[arg-type]
     paths = [Path(part) for part in parts]

@@ -15,6 +15,7 @@ from groma.io._numbering import numbered_keypoints
 from groma.io.colmap.load import load_pycolmap
 from groma.scene import Cameras, Scene, Sensors
 from groma.scene.camera import CAMERA
+from groma.scene.checks import check_scene_given
 
 if TYPE_CHECKING:
     import pycolmap
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 def to_pycolmap(scene: Scene, points: bool = True) -> pycolmap.Reconstruction:
     """Return a :class:`pycolmap.Reconstruction` of cameras, rigs, frames, images and, if wanted, points of a scene."""
+    check_scene_given(scene)
     pycolmap = load_pycolmap()
     reconstruction = pycolmap.Reconstruction()
     for row, number in enumerate(scene.cameras.ids.tolist()):

@@ -25,7 +25,7 @@ from functools import partial
 import numpy as np
 
 from groma._typing import IntArray
-from groma.errors import InputError, given_or_default
+from groma.errors import InputError, check_kind, given_or_default
 from groma.execution import work_with
 from groma.features.matches import LineMatches
 from groma.features.segments import Segments
@@ -95,6 +95,7 @@ def map_lines(
     """
     options = given_or_default(options, MapLinesOptions)
     check_scene_given(scene)
+    check_kind(segments, Sequence, "segments", "Pass a list with the Segments of each image.")
     if len(segments) != scene.num_images:
         raise InputError(
             f"segments must hold one set per image of the scene ({scene.num_images}); got {len(segments)}. "
