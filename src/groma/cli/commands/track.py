@@ -19,7 +19,8 @@ def track(
     sequence: Annotated[
         Path,
         typer.Argument(
-            metavar="SEQUENCE", help="Folder of TUM RGB-D, 7-Scenes, KITTI, EuRoC or plain images; or a video."
+            metavar="SEQUENCE",
+            help="Folder of TUM RGB-D, 7-Scenes, KITTI, EuRoC, stereo pairs or plain images; or a video.",
         ),
     ],
     output: Annotated[Path, _options.PLAIN.option("Folder for the results.", "--output", "-o", metavar="OUT")],

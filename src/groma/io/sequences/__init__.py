@@ -41,7 +41,8 @@ def open_sequence(
     ----------
     path : path
         A folder of TUM RGB-D (``rgb.txt``), 7-Scenes (``frame-000000.color.png``), KITTI odometry (``image_0``) or
-        EuRoC (``mav0``), a folder with ``rgb`` or ``color`` and ``depth``, a folder of images, or a video file.
+        EuRoC (``mav0``), stereo pairs in ``left`` and ``right``, a folder with ``rgb`` or ``color`` and ``depth``, a
+        folder of images, or a video file.
     camera : SequenceCamera, numbers, str or path, optional
         The camera, overriding that of the folder: ``fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]]`` as OpenCV
         counts (the first pixel's centre is (0, 0)), a line of COLMAP's ``cameras.txt`` (the first pixel's centre is
