@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from groma._rows import Rows, distinct, medians, pointers_of
+from groma._rows import Rows, distinct, medians, pointers_of, sorted_within
 from groma.tracking.frame.measurements import LineMeasurements, PlaneMeasurements, PointMeasurements
 from groma.tracking.map.lines import FollowedSegments
 
@@ -52,6 +52,15 @@ def test_pointers_of_groups_are_whole_numbers_also_without_groups():
     np.testing.assert_array_equal(pointers_of([2, 0, 3]), [0, 2, 2, 5])
     np.testing.assert_array_equal(pointers_of(np.array([True, False])), [0, 1, 1])
     assert pointers_of([]).tolist() == [0] and pointers_of([]).dtype == np.int64
+
+
+def test_sorted_within_groups_is_what_lexsort_gives():
+    """Of few groups and of more than fit a byte, and of none."""
+    rng = np.random.default_rng(4)
+    for count in (3, 300):
+        values, group = rng.normal(size=2000), rng.integers(0, count, 2000)
+        np.testing.assert_array_equal(sorted_within(values, group, count), np.lexsort([values, group]))
+    assert sorted_within(np.zeros(0), np.zeros(0, int), 0).shape == (0,)
 
 
 def test_medians_of_groups():
