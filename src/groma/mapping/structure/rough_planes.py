@@ -175,7 +175,8 @@ def _leans(whole: PlaneSet, planes: PlaneSet, group: list[int]) -> bool:
     """
     basis = np.stack(perpendicular(whole.planes[0, :3]))
     turned, noise = _turned(basis, planes, group)
-    shape = np.linalg.inv([np.cov(planes.places[b] @ basis.T, rowvar=False) for b in group])
+    scatter = [np.cov(planes.places[b] @ basis.T, rowvar=False) for b in group]
+    shape = np.asarray(np.linalg.inv(scatter), dtype=np.float64)
     information = np.linalg.inv(noise + _spread(turned, noise, shape, 2 * len(group) - 2) * shape)
     known = np.linalg.inv(information.sum(axis=0))
     mean = known @ np.einsum("kab,kb->a", information, turned)
