@@ -55,29 +55,25 @@ def follow_frame(
     ``expected`` is the predicted pose with its standard deviations (6,). Lines and planes are found beside points in a
     pool. Where so many points are gone that features will be asked anyway, lines are not followed, unless few are left:
     without lines their pose is a poor guess. If the frame before was ``searched``, lines do not begin before points,
-    and a part of the points is followed first: where most of it is gone, so are the others, and features are asked.
+    and a part of the points is followed first: where most of it is gone, it does for a guess.
     """
     camera, options, gates = data.camera, data.options, data.options.gates
     predicted, prior_sigma = expected
     tracks, segments = followed.points, followed.lines
-    tracks = tracks.take(track_map.points.state[tracks.index] != DEAD)
-
-    def carry_on(some: PointTracks) -> PointTracks:
-        with watch("points"):
-            return follow_points(
-                track_map, camera, some, before.gray, data.gray, predicted, previous, POINT_TRACKS.max_shift
-            )
-
-    if options.points and searched:
-        part = tracks.take(np.arange(0, len(tracks), gates.points.first_of))
-        left = int(track_map.points.alive[carry_on(part).index].sum())
-        if misses_much(track_map, camera, part, predicted, left, gates):
-            return None, Followed.nothing()
     with_lines = options.lines and len(segments.index) > 0
     at_once = pool if with_lines and not searched else None
     lines_followed = beside(at_once, partial(follow_lines, track_map, before, data, segments))
     planes_found = beside(pool if data.frame.depth is not None else None, lambda: data.planes)
-    tracks = carry_on(tracks) if options.points else tracks
+    with watch("points"):
+        tracks = tracks.take(track_map.points.state[tracks.index] != DEAD)
+        if options.points:
+            images = before.gray, data.gray, predicted, previous, POINT_TRACKS.max_shift
+            part = tracks.take(np.arange(0, len(tracks), gates.points.first_of if searched else 1))
+            left = follow_points(track_map, camera, part, *images)
+            count = int(track_map.points.alive[left.index].sum())
+            if searched and not misses_much(track_map, camera, part, predicted, count, gates):
+                left = follow_points(track_map, camera, tracks, *images)
+            tracks = left
     alive = track_map.points.alive[tracks.index]
     with watch("depth"):
         measured = measure_points(track_map, data, predicted, tracks.take(alive))
