@@ -2,8 +2,6 @@
 """Rigs that are held and do not fit the images: told, with numbers; rigs that fit: nothing is said."""
 
 import re
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -95,8 +93,8 @@ def test_a_map_counts_its_rig_among_what_was_estimated():
     for refined in (False, True):
         told = AdjustOptions(refine_rigs=refined, loss="cauchy", loss_scale=4.0)
         found = adjust(rig_scene(MOUNTED), told)
-        result: Any = SimpleNamespace(adjusted=found.scene, adjusted_with=told, report=found.report)
-        known = MapResult.pose_uncertainty(result)
+        scenes = [found.scene] * 4
+        known = MapResult(*scenes, found.report, told, {}, "", {}, ()).pose_uncertainty()
         expected = pose_uncertainty(found.scene, found.problem, found.report.sigma0, by_landmarks=True)
         # Written to a scene and read again, poses differ in their last digits.
         assert known["center"]["median"] == pytest.approx(expected["center"]["median"], rel=1e-6)

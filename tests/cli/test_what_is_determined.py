@@ -56,16 +56,15 @@ def test_problems_are_said_and_notes_are_not(scenes, here, capsys):
 
 def test_a_map_is_diagnosed_at_its_own_noise(scenes):
     """Twice the noise, twice as weak."""
-    from types import SimpleNamespace
-
     from groma.mapping.result import MapResult
 
     scene = read_scene(scenes / "truth.npz").replace(relations=Relations())  # these have a noise of their own
     weakness = []
     for sigma in (20.0, 10.0):
         told = AdjustOptions(point_sigma_px=sigma, line_sigma_px=sigma, loss_scale=6.0)
-        result: Any = SimpleNamespace(num_photographs=0, scene=scene, adjusted_with=told)
-        weakness.append(MapResult.diagnose(result).weakness["points"])
+        report: Any = None  # of which nothing is asked
+        result = MapResult(scene, scene, scene, scene, report, told, {}, "", {}, ())
+        weakness.append(result.diagnose().weakness["points"])
     # The loss, which is twelve times as wide as the noise, takes hardly anything off residuals of half a pixel.
     np.testing.assert_allclose(weakness[0], 2 * weakness[1], rtol=1e-3)
 

@@ -61,7 +61,7 @@ class _Map:
     def camera_of_map(self, *size):
         return OF_MAP
 
-    def localize(self, image, camera, refine):
+    def localize(self, image, camera, refine, used):
         self.asked.append((camera, refine))
         raise InputError("That is enough.")
 
@@ -70,5 +70,5 @@ def test_a_query_is_compared_with_a_photograph_of_its_size(tmp_path):
     files = [_photograph(tmp_path / "other.jpg", 54), _photograph(tmp_path / "same.jpg", 24)]
     map_ = _Map(files)
     assert Localizer.photograph_of_map(map_, 10, 10) is None
-    run._localize(map_, "query.jpg", _photograph(tmp_path / "query.jpg", 24), CalibrationChoice())
+    run._localize(map_, "query.jpg", _photograph(tmp_path / "query.jpg", 24), CalibrationChoice(), None)
     assert map_.asked == [(OF_MAP, False)]
