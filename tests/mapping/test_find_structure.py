@@ -14,7 +14,7 @@ from groma.errors import InputError
 from groma.geometry import quaternion
 from groma.io import read_scene
 from groma.mapping.noise.landmarks import line_noise, point_noise
-from groma.mapping.structure import find
+from groma.mapping.structure import rough_planes
 from groma.mapping.structure.find import StructureOptions, detect_structure, find_structure, landmark_noise
 from groma.scene import Directions, Planes, Relations, RightColumns, Scene
 from groma.scene.synthetic.scenes import corridor, holistic
@@ -200,18 +200,19 @@ def test_facade_of_real_church(shared_data):
 
 
 def test_a_plane_that_was_lost_among_the_pieces_of_another_is_found_again(monkeypatch):
-    """As if pieces of a wall had held its landmarks, it is gone after planes were joined."""
+    """As if the first plane were a piece of the second: what it was found in is free again."""
     _, scene = measured("corridor", "tiny")
-    usual, fitted, calls = find_structure(scene), find.on_fitted_planes, []
+    usual, joined, calls = find_structure(scene), rough_planes._joined, []
 
     def losing(marks, planes, *args, **kwargs):
         calls.append(len(planes))
-        if len(calls) == 1:
-            planes = planes.take(np.arange(1, len(planes)), np.arange(-1, len(planes) - 1))
-        return fitted(marks, planes, *args, **kwargs)
+        if len(calls) > 1:
+            return joined(marks, planes, *args, **kwargs)
+        into = np.maximum(np.arange(len(planes)) - 1, 0)
+        return into, planes.take(np.arange(1, len(planes)), into)
 
-    monkeypatch.setattr(find, "on_fitted_planes", losing)
+    monkeypatch.setattr(rough_planes, "_joined", losing)
     again = find_structure(scene)
-    assert len(calls) == 2 and again.num_planes == usual.num_planes > 1
+    assert calls == [usual.num_planes] * 2 and again.num_planes == usual.num_planes > 1
     normals = usual.planes.hesse[:, :3]
     np.testing.assert_allclose(np.abs(normals @ again.planes.hesse[:, :3].T).max(axis=1), 1.0, atol=1e-4)

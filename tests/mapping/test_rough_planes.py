@@ -10,7 +10,7 @@ from groma.estimators.plane_search import PlaneSet
 from groma.gates import chi_square_gate
 from groma.mapping.noise.landmarks import LineNoise, PointNoise
 from groma.mapping.structure.relations import Landmarks, on_planes, spacings
-from groma.mapping.structure.rough_planes import _leans, _spread, on_fitted_planes, released
+from groma.mapping.structure.rough_planes import _leans, _released, _spread, on_fitted_planes
 from groma.scene import LineIntervals
 
 SIGMA, LEVEL, LEAST, SUPPORT = 0.002, 0.99, (0.7, 0.9), 20
@@ -262,7 +262,34 @@ def test_landmarks_that_a_joined_plane_does_not_pass_through_are_free_again():
     marks.segments[0, 1, 2] = 0.1  # one end is off
     points, lines = on_planes(marks, joined, LEVEL, LEAST)
     beside = int(np.setdiff1d(np.flatnonzero(~panel(marks.points)), points.pairs[:, 0])[0])  # in the layer, no member
-    known = released(marks, joined, points, lines)
+    known = _released(marks, joined, points, lines)
     np.testing.assert_array_equal(known.point_label, np.where(panel(marks.points), -1, 0))
     assert known.point_label[beside] == 0 and known.segment_label.tolist() == [-1] + [0] * 39
     np.testing.assert_array_equal(joined.point_label, 0)  # not changed
+
+
+def test_a_wall_of_pieces_is_known_as_well_whether_planes_are_found_beside_it_or_not():
+    """Members of one piece deviate alike: that stays known of a wall whose pieces have become one."""
+    marks = wall(0.004, before=0.1)
+    left, front = marks.points[:, 0] < 0.0, panel(marks.points)
+    pieces = pieces_of(marks, [0.003, -0.003], [left, ~left & ~front])
+    asked = []
+
+    def with_panel(told):
+        asked.append(told)
+        other = pieces_of(marks, [0.1], [front])
+        together = {
+            name: np.concatenate([getattr(told, name), getattr(other, name)])
+            for name in ("planes", "covariance", "support", "share", "band", "log10_false_alarms")
+        }
+        label = np.where(front, 1, told.point_label)
+        return replace(told, **together, point_label=label, places=[*told.places, *other.places])
+
+    alone, alone_on, _ = on_fitted_planes(marks, pieces, LEVEL, LEAST, SUPPORT)
+    both, both_on, _ = on_fitted_planes(marks, pieces, LEVEL, LEAST, SUPPORT, with_panel)
+    assert len(alone) == len(asked[0]) == 1 and len(both) == 2
+    np.testing.assert_array_equal(asked[0].point_label[front], -1)
+    np.testing.assert_array_equal(both_on.pairs[both_on.pairs[:, 1] == 0, 0], alone_on.pairs[:, 0])
+    # It is fitted and told once more, with a change of hundred-thousandths of its deviation.
+    np.testing.assert_allclose(both.planes[0], alone.planes[0], atol=1e-4 * np.sqrt(np.trace(alone.covariance[0])))
+    np.testing.assert_allclose(both.covariance[0], alone.covariance[0], rtol=1e-3, atol=1e-4 * alone.covariance.max())

@@ -36,7 +36,7 @@ from groma.mapping.structure.angles import Vector, angles_between, vertical_of
 from groma.mapping.structure.bending import bending
 from groma.mapping.structure.junctions import meetings
 from groma.mapping.structure.relations import Landmarks, Pairs, on_lines, spacings
-from groma.mapping.structure.rough_planes import on_fitted_planes, released
+from groma.mapping.structure.rough_planes import on_fitted_planes
 from groma.scene import Directions, Held, Planes, Relations, Scene
 from groma.scene.checks import check_scene_given
 from groma.scene.survey import Kind
@@ -159,17 +159,13 @@ def detect_structure(
     on_line = on_lines(marks, level, least)
     search = partial(_planes_in, marks, on_line, options, partial(report, "finding planes"))
     enough = options.planes.min_support
-    fitted = partial(on_fitted_planes, marks, level=level, least=(least, least_line), min_support=enough)
-    first = search()
-    told = fitted(first)
-    if len(told[0]) < len(first):  # what became pieces of a wall may have held landmarks of planes that were not found
-        more = search(released(marks, *told))
-        told = fitted(more) if len(more) > len(told[0]) else told
+    planes, point_on_plane, line_on_plane = on_fitted_planes(
+        marks, search(), level, (least, least_line), enough, again=search
+    )
     report("finding directions", 0, 1)
     directions, along = parallels()
     found = {"lines_meeting": meeting()}
     report("finding relations", 0, 1)
-    planes, point_on_plane, line_on_plane = told
     support = point_on_plane.counts(len(planes)) + 2 * line_on_plane.counts(len(planes))
     kept = (support >= (enough + 1) // 2) & ~bending(marks, planes, point_on_plane, line_on_plane, level)
     planes, new = _only(planes, kept)

@@ -21,7 +21,7 @@ another plane, a panel before the wall: they are free again once it has become p
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -47,7 +47,12 @@ _Told = tuple[PlaneSet, Pairs, Pairs]
 
 
 def on_fitted_planes(
-    marks: Landmarks, planes: PlaneSet, level: float, least: tuple[float, float], min_support: int
+    marks: Landmarks,
+    planes: PlaneSet,
+    level: float,
+    least: tuple[float, float],
+    min_support: int,
+    again: Callable[[PlaneSet], PlaneSet] | None = None,
 ) -> tuple[PlaneSet, Pairs, Pairs]:
     """Return the planes fitted to what lies on them, with how far it deviates, and the points and lines on planes.
 
@@ -62,6 +67,9 @@ def on_fitted_planes(
     min_support : int
         Least number of members that tell how far they deviate, a segment counts as two: with fewer the members of a
         plane stay.
+    again : callable, optional
+        Returns planes and others beside them, in what has no label of theirs: what became a piece of a wall may have
+        held landmarks of planes that were not found.
 
     Returns
     -------
@@ -71,13 +79,22 @@ def on_fitted_planes(
         What lies on them.
     """
     fitted = partial(_fitted_in_turn, marks, level=level, least=least, min_support=min_support, known={})
-    found = fitted(planes)
-    into, joined = _joined(marks, *found, fitted, level)
-    planes, points, lines = found if joined is found[0] else fitted(joined)
+    pieces = fitted(planes)
+    into, joined = _joined(marks, *pieces, fitted, level)
+    told, before = pieces if joined is pieces[0] else fitted(joined), pieces[1:]
+    settled = len(told[0])
+    if again is not None and joined is not pieces[0] and len(more := again(_released(marks, *told))) > settled:
+        found = fitted(more)
+        number, joined = _joined(marks, *found, fitted, level, settled)
+        told = found if joined is found[0] else fitted(joined)
+        fresh = np.r_[np.full(settled, -1), len(into) + np.arange(len(more) - settled)]
+        before = tuple(one.joined(new.renumbered(fresh)) for one, new in zip(before, found[1:], strict=True))
+        into = np.concatenate([number[into], number[settled:]])
+    planes, points, lines = told
     # A plane was found in features of which others may have taken some: they say nothing about where it is.
     enough = np.flatnonzero(_num_members(points, lines, len(planes)) > _UNKNOWNS)
     planes = _fitted(marks, planes, points, lines, deviations(points, lines, len(planes)), enough)
-    return _with_shared_deviations(marks, planes, points, lines, found[1:], into), points, lines
+    return _with_shared_deviations(marks, planes, points, lines, before, into), points, lines
 
 
 def _fitted_in_turn(
@@ -96,9 +113,18 @@ def _fitted_in_turn(
 
 
 def _joined(
-    marks: Landmarks, planes: PlaneSet, points: Pairs, lines: Pairs, fitted: Callable[[PlaneSet], _Told], level: float
+    marks: Landmarks,
+    planes: PlaneSet,
+    points: Pairs,
+    lines: Pairs,
+    fitted: Callable[[PlaneSet], _Told],
+    level: float,
+    settled: int = 0,
 ) -> tuple[IntArray, PlaneSet]:
-    """Into which plane each goes, and the planes with pieces of rough walls joined: the same ones where none are."""
+    """Into which plane each goes, and the planes with pieces of rough walls joined: the same ones where none are.
+
+    Of the first ones, ``settled``, it is known that they are no pieces of each other.
+    """
     num = len(planes)
     rough, members = deviations(points, lines, num), _num_members(points, lines, num)
     free = members > 0
@@ -109,6 +135,8 @@ def _joined(
             continue
         free[k] = False  # a piece has fewer members than what it is a piece of
         group = _beside(marks, planes, points, lines, k, free)
+        if max(group) < settled:
+            continue
         if not rough[group].any() and not _contradict(planes, group, level):
             continue
         whole, group = _whole(marks, planes, points, lines, group, rough[group].max(), fitted)
@@ -307,7 +335,7 @@ def members_of(
 
 
 def _with_shared_deviations(
-    marks: Landmarks, planes: PlaneSet, points: Pairs, lines: Pairs, before: tuple[Pairs, Pairs], into: IntArray
+    marks: Landmarks, planes: PlaneSet, points: Pairs, lines: Pairs, before: Sequence[Pairs], into: IntArray
 ) -> PlaneSet:
     """Return the planes, the joined ones with the covariance that they have if the members of a piece deviate alike.
 
@@ -330,7 +358,7 @@ def _with_shared_deviations(
     return replace(planes, covariance=covariance)
 
 
-def _pieces(points: Pairs, lines: Pairs, before: tuple[Pairs, Pairs], into: IntArray, plane: int) -> IntArray:
+def _pieces(points: Pairs, lines: Pairs, before: Sequence[Pairs], into: IntArray, plane: int) -> IntArray:
     """(M,) the piece that each point and segment end on a plane is on; those on none have numbers of their own."""
     numbers, free = [], len(into)
     for found, earlier, ends in ((points, before[0], 1), (lines, before[1], 2)):
@@ -344,7 +372,7 @@ def _pieces(points: Pairs, lines: Pairs, before: tuple[Pairs, Pairs], into: IntA
     return np.concatenate(numbers)
 
 
-def released(marks: Landmarks, planes: PlaneSet, points: Pairs, lines: Pairs) -> PlaneSet:
+def _released(marks: Landmarks, planes: PlaneSet, points: Pairs, lines: Pairs) -> PlaneSet:
     """Return planes with labels of what lies on them; what they were found in, but is beyond the layer, is free."""
 
     def labels(before: IntArray, usable: BoolArray, places: FloatArray, found: Pairs) -> IntArray:
