@@ -164,9 +164,15 @@ def test_a_folder_where_nothing_can_be_made(tmp_path, monkeypatch):
         check_output(tmp_path / "a.txt", force=False)
 
 
-def test_missing_parent(tmp_path):
-    with pytest.raises(OutputError, match="does not exist"):
-        check_output(tmp_path / "no" / "a.txt", force=False)
+def test_missing_folders_are_made_when_something_is_written(tmp_path):
+    path = tmp_path / "no" / "folder" / "a.txt"
+    check_outputs(False, path)
+    assert os.listdir(tmp_path) == []
+    with atomic_output(path, force=False) as draft:
+        draft.write_text("a")
+    assert path.read_text() == "a"
+    with pytest.raises(OutputError, match=r"a\.txt is a file"):
+        check_output(path / "further" / "b.txt", force=False)
 
 
 def test_writing_nothing_is_an_error(tmp_path):

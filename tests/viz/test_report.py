@@ -262,6 +262,7 @@ def test_the_summary_of_a_map_stands_in_the_page(tmp_path):
 
 
 def test_a_place_that_cannot_be_written(tmp_path):
+    (tmp_path / "no").touch()
     with pytest.raises(OutputError, match="Cannot write"):
         write_report(tmp_path / "no" / "page.html", None, exact_scene())
 

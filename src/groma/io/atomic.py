@@ -24,7 +24,7 @@ def atomic_output(
     Parameters
     ----------
     path : path
-        The result. Its folder must exist.
+        The result. Folders above it that are missing are made.
     force : bool
         Replace an existing file or folder, which is refused otherwise.
     workshop_in : path, optional
@@ -40,6 +40,7 @@ def atomic_output(
     if not force and (target.exists() or target.is_symlink()):
         raise OutputError(f"{path} exists already. Pass force=True (--force) to replace it, or choose another name.")
     try:
+        target.parent.mkdir(parents=True, exist_ok=True)
         workshop = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=workshop_in or target.parent))
     except OSError as error:
         raise OutputError(f"Cannot write {path}: {error.strerror or error}. Choose another place.") from error

@@ -60,7 +60,7 @@ def check_outputs(
 
 
 def check_output(path: Path, force: bool, file: bool = False) -> None:
-    """Refuse, before any work, what :func:`atomic_output` would refuse at the end.
+    """Refuse, before any work, what :func:`atomic_output` would refuse at the end. It makes folders that are missing.
 
     Parameters
     ----------
@@ -71,10 +71,9 @@ def check_output(path: Path, force: bool, file: bool = False) -> None:
     file : bool
         The result is a file: it never replaces a folder.
     """
-    parent = path.absolute().parent
+    parent = next(folder for folder in path.absolute().parents if folder.exists())
     if not parent.is_dir():
-        wrong = "is a file. Choose another place." if parent.is_file() else "does not exist. Make it first."
-        raise OutputError(f"Cannot write {path}: the folder {parent} {wrong}")
+        raise OutputError(f"Cannot write {path}: {parent} is a file. Choose another place.")
     try:
         tempfile.TemporaryDirectory(prefix=".groma.", dir=parent).cleanup()
     except OSError as error:

@@ -132,8 +132,6 @@ def _checked(source: Path, output: Path | None, refused: dict[str, Any]) -> Path
         raise InputError("Parts are adjusted into a folder: pass -o OUT.")
     if output.exists() and not output.is_dir():
         raise InputError(f"{output} is a file; parts are written into a folder. Choose another name.")
-    if not output.absolute().parent.is_dir():
-        raise InputError(f"Cannot write {output}: the folder {output.absolute().parent} does not exist. Make it first.")
     return output
 
 
