@@ -19,6 +19,7 @@ from groma.errors import InputError, OutputError
 from groma.evaluation import cabinet
 from groma.geometry import so3
 from groma.io import read_scene, write_scene
+from groma.io.colmap.masks import Masks
 from groma.localization import extension, features
 from groma.localization.calibration import CalibrationChoice
 from groma.localization.extension import _with_new_lenses, extended_model, in_world_of
@@ -142,6 +143,20 @@ def test_new_photographs_get_poses_and_points_with_the_others(maps, place, truth
     assert {path.name: path.resolve() for path in made.folder.iterdir()} == {
         name: (place / half / name).resolve() for half, names in HALVES.items() for name in names
     }
+
+
+def test_masks_hide_parts_of_new_photographs_from_points_too(maps, place, tmp_path):
+    """One that has the name of a photograph of the map has another in the model, and its mask by that."""
+    name, other = HALVES["b"][1], HALVES["a"][0]
+    cv2.imwrite(str(tmp_path / "mask.png"), np.repeat(np.uint8([[0, 255]]), 480, axis=0).repeat(320, axis=1))
+    files = {other: place / "b" / name}
+    made = extended_model(
+        *(maps["a"], files, tmp_path / "work", tmp_path / "images", CalibrationChoice(), quiet),
+        Masks.of(tmp_path / "mask.png", list(files)),
+    )
+    seen, image = made.scene.point_observations, list(made.scene.images.names).index(f"query/{other}")
+    assert (seen.image_idx == image).sum() > 10 and (seen.pixel[seen.image_idx == image, 0] > 320.0).all()
+    assert not made.masks.read(f"query/{other}", (640, 480))[:, :320].any()
 
 
 def test_calibrations_of_new_cameras_are_estimated_unless_they_are_a_given_one():

@@ -133,7 +133,11 @@ def test_the_command(folders, tmp_path):
         return CliRunner().invoke(app, ["track", *map(str, arguments), "--camera", camera])
 
     first, second, third = (tmp_path / name for name in ("first", "second", "third"))
-    assert run(folders[0], "-o", first).exit_code == 0
+    mask = tmp_path / "mask.png"
+    cv2.imwrite(str(mask), np.repeat(np.uint8([[0]] * 9 + [[255]] * (_room.HEIGHT - 9)), _room.WIDTH, axis=1))
+    assert run(folders[0], "--masks", mask, "-o", first).exit_code == 0
+    # Whoever tracks in its map reads the frames with the mask that it had.
+    assert not any(f.used[:9].any() for source in read_saved_map(first).sources for f in source.read().values())
     result = run(folders[1], "--map", first, "-o", second)
     assert result.exit_code == 0, result.output
     told = json.loads((second / "summary.json").read_text())

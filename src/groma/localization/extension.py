@@ -14,10 +14,12 @@ from groma._counted import counted
 from groma.adjustment.terms.principal_points import near_the_middle
 from groma.errors import InputError
 from groma.evaluation.alignment import align_poses
+from groma.io.colmap.masks import Masks
 from groma.localization.calibration import CalibrationChoice
 from groma.localization.localizer import Localizer
 from groma.localization.map_index import Progress
 from groma.localization.posed_model import gather_photographs, with_photographs
+from groma.localization.registered import QUERY
 from groma.localization.run import localize_images
 from groma.localization.stored import StoredImage
 from groma.mapping.photographs import content_digest
@@ -40,6 +42,8 @@ class ExtendedModel:
     queries: tuple[StoredImage, ...]
     #: Photographs that the map has already.
     num_known: int = 0
+    #: What may be used of all of them.
+    masks: Masks | None = None
 
     def warnings(self) -> list[str]:
         """Say which photographs are left out."""
@@ -57,7 +61,13 @@ class ExtendedModel:
 
 
 def extended_model(
-    localizer: Localizer, files: Mapping[str, Path], work: Path, folder: Path, choice: CalibrationChoice, say: Progress
+    localizer: Localizer,
+    files: Mapping[str, Path],
+    work: Path,
+    folder: Path,
+    choice: CalibrationChoice,
+    say: Progress,
+    masks: Masks | None = None,
 ) -> ExtendedModel:
     """Return the model of a map and new photographs.
 
@@ -75,6 +85,8 @@ def extended_model(
         Where calibrations come from.
     say
         Progress.
+    masks
+        What may be used of the photographs.
 
     Raises
     ------
@@ -84,10 +96,12 @@ def extended_model(
     num_given, files = len(files), _without_known(files, localizer.files)
     if not files:
         raise InputError(f"The map has all of the {counted(num_given, 'photographs')} already. Pass new ones.")
+    if masks is not None:  # of new photographs also by the names that they have in the model
+        masks = replace(masks, files=masks.files + tuple((f"{QUERY}{name}", *rest) for name, *rest in masks.files))
     before, done = localizer.scene, dict[str, StoredImage]()
     waiting, scene = dict(files), localizer.scene
     for turn in range(len(files)):
-        found = localize_images(localizer, waiting, work / str(turn), choice, say)
+        found = localize_images(localizer, waiting, work / str(turn), choice, say, masks)
         done |= {one.name: one for one in found}
         placed = [one for one in found if one.status == "localized"]
         if not placed and turn == 0:
@@ -96,14 +110,14 @@ def extended_model(
             break
         waiting = {one.name: waiting[one.name] for one in found if one.status != "localized"}
         paths = [*localizer.files, *(files[one.name] for one in placed)]
-        scene = with_photographs(localizer.scene, localizer.index, placed, paths, say)
+        scene = with_photographs(localizer.scene, localizer.index, placed, paths, say, masks)
         scene = _with_new_lenses(scene, localizer.scene)
         gather_photographs(folder, dict(zip(scene.images.names, paths, strict=True)))
         if not waiting:
             break
         # What shows nothing of the map may show what the photographs do that are in it now.
         localizer = Localizer(scene, folder, options=localizer.options, progress=say)
-    return ExtendedModel(scene, folder, before, tuple(done[name] for name in files), num_given - len(files))
+    return ExtendedModel(scene, folder, before, tuple(done[name] for name in files), num_given - len(files), masks)
 
 
 def _with_new_lenses(scene: Scene, before: Scene) -> Scene:

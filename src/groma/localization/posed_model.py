@@ -19,12 +19,14 @@ from groma.bounded.names import stays_inside
 from groma.errors import InputError
 from groma.execution import map_work
 from groma.gates import NORMAL, chi_square_gate
+from groma.io.colmap.masks import Masks
 from groma.localization.features import DescribedPoints, find_corners, find_points
 from groma.localization.map_index import MapIndex, Progress
 from groma.localization.registered import with_queries
 from groma.localization.retrieval import VladRetrieval
 from groma.localization.stored import StoredImage
 from groma.localization.triangulation import triangulate_features
+from groma.mapping.image_segments import is_used
 from groma.mapping.noise.landmarks import pixels_of
 from groma.mapping.photographs import read_gray
 from groma.scene import Keypoints, PointObservations, Points, Scene
@@ -37,7 +39,12 @@ _SAME_PLACE = 1.0
 
 
 def with_photographs(
-    scene: Scene, index: MapIndex, queries: Sequence[StoredImage], files: Sequence[Path], say: Progress
+    scene: Scene,
+    index: MapIndex,
+    queries: Sequence[StoredImage],
+    files: Sequence[Path],
+    say: Progress,
+    masks: Masks | None = None,
 ) -> Scene:
     """Return a map with more photographs, and points that tie them to it and to each other.
 
@@ -55,6 +62,8 @@ def with_photographs(
         Of all photographs, those of the map first.
     say
         Progress.
+    masks
+        What may be used of the photographs.
 
     Raises
     ------
@@ -62,7 +71,8 @@ def with_photographs(
         If an image cannot be read, or no point is seen by a new photograph.
     """
     both = with_queries(scene, index, [_without_landmarks(one) for one in queries])
-    features = map_work(_find, list(files), partial(say, "finding points in images"))
+    photographs = list(zip(both.images.names, files, strict=True))
+    features = map_work(partial(_find, masks), photographs, partial(say, "finding points in images"))
     made = triangulate_features(both, features, _pairs(features), partial(say, "placing points"))
     image = np.repeat(np.arange(len(features)), [len(one) for one in features])
     row = np.flatnonzero(made.point >= 0)
@@ -121,9 +131,12 @@ def _first_of_each(rows: IntArray) -> BoolArray:
     return first
 
 
-def _find(path: Path) -> DescribedPoints:
+def _find(masks: Masks | None, photograph: tuple[str, Path]) -> DescribedPoints:
+    name, path = photograph
     image = read_gray(path)
-    return find_points(image).joined(find_corners(image))
+    points = find_points(image).joined(find_corners(image))
+    used = None if masks is None else masks.read(name, (image.shape[1], image.shape[0]))
+    return points if used is None else points.take(is_used(used, points.pixels))
 
 
 def _pairs(features: Sequence[DescribedPoints]) -> IntArray:

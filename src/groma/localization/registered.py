@@ -15,6 +15,9 @@ from groma.scene import Cameras, Frames, Images, LineObservations, PointObservat
 from groma.scene.camera import CAMERA
 from groma.scene.table import Table, joined, references
 
+#: Folder for the names of queries that an image of the map has, too.
+QUERY = "query/"
+
 
 def with_queries(scene: Scene, index: MapIndex, queries: Sequence[StoredImage]) -> Scene:
     """Return a map with queries as images after its own, and the points that they see.
@@ -86,9 +89,9 @@ def _own_cameras(scene: Scene) -> dict[tuple[object, ...], tuple[int, ...]]:
 
 
 def _names(scene: Scene, queries: Sequence[StoredImage]) -> tuple[str, ...]:
-    """Names of queries; those that an image of the map has, too, are put into a folder ``query``."""
+    """Names of queries; those that an image of the map has, too, are put into the folder ``query``."""
     taken = set(scene.images.names)
-    names = tuple(f"query/{one.name}" if one.name in taken else one.name for one in queries)
+    names = tuple(f"{QUERY}{one.name}" if one.name in taken else one.name for one in queries)
     if len({*names, *taken}) < len(names) + len(taken):
         raise InputError("Queries and images of the map have the same names. Put the queries into a folder above.")
     return names

@@ -29,15 +29,19 @@ class FrameSource:
     camera: str | None = None
     depth_scale: float | None = None
     kind: Kind | None = None
+    #: Its masks, a folder or one image for all.
+    masks: str | None = None
     #: Name of the image in the scene -> name of the frame.
     images: dict[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, path: str | os.PathLike[str], camera: str | None = None, **how: Any) -> FrameSource:
+    def of(
+        cls, path: str | os.PathLike[str], camera: str | None = None, masks: Path | None = None, **how: Any
+    ) -> FrameSource:
         """Return a source with full paths."""
         if camera is not None and os.path.exists(camera):
             camera = os.path.abspath(camera)
-        return cls(os.path.abspath(path), camera, **how)
+        return cls(os.path.abspath(path), camera, masks=None if masks is None else os.path.abspath(masks), **how)
 
     def with_images(self, names: tuple[str, ...], frames: set[str]) -> FrameSource:
         """Return the source with the images of a scene that are frames of it."""
@@ -56,7 +60,8 @@ class FrameSource:
         InputError
             If the sequence is not there any more, or some of its frames are not.
         """
-        sequence = open_sequence(self.path, camera=self.camera, depth_scale=self.depth_scale, kind=self.kind)
+        how = {"camera": self.camera, "depth_scale": self.depth_scale, "kind": self.kind, "masks": self.masks}
+        sequence = open_sequence(self.path, **how)
         wanted = {frame: image for image, frame in self.images.items()}
         found: dict[str, Frame] = {}
         for frame in sequence:
@@ -134,12 +139,12 @@ def read_saved_map(folder: str | os.PathLike[str]) -> SavedMap:
 
 
 def _source(told: dict[str, Any]) -> FrameSource:
-    camera, scale, kind = (told.get(name) for name in ("camera", "depth_scale", "kind"))
-    good = isinstance(told["path"], str) and kind in (None, "rgbd", "stereo", "mono")
+    camera, scale, kind, masks = (told.get(name) for name in ("camera", "depth_scale", "kind", "masks"))
+    good = isinstance(told["path"], str) and kind in (None, "rgbd", "stereo", "mono") and isinstance(masks, str | None)
     if not good or not isinstance(camera, str | None) or not isinstance(scale, int | float | None):
         raise ValueError("not a source")
     images = {str(image): str(frame) for image, frame in told["images"].items()}
-    return FrameSource(told["path"], camera, scale, cast("Kind | None", kind), images)
+    return FrameSource(told["path"], camera, scale, cast("Kind | None", kind), masks, images)
 
 
 def sources_of(

@@ -182,7 +182,7 @@ def map_(
     images = _photographs_of(console, images, model)
     maps = _depth.depth_maps(depth, depth_scale, relative_depth, images)
     known = {"--model": model, "--poses": poses, "--rig": rig, "--camera-params": camera_params, "--depth": depth}
-    check_extension(extend, map_images, known | {"--masks": masks})
+    check_extension(extend, map_images, known)
     _check_start(model, poses, rig)
     placed = model is not None or poses is not None or extend is not None
     refuse_idle(
@@ -220,7 +220,7 @@ def map_(
         mapper=mapper,
         rigs=() if any(given is not None for given in (model, poses, extend)) else _rigs(console, images, rig),
         refine_rigs=refine_rig,
-        masks=_masks_of(masks, images),
+        masks=_masks_of(masks, images, extend),
         rolling_shutter=rolling_shutter,
         keep_suspects=measured.keep_suspects,
         threads=console.threads,
@@ -233,8 +233,8 @@ def map_(
     photographs, extended = images, None
     if extend is not None:
         stages = stages_of_map(options, "model", bool(measured), matches is not None)
-        extended = extend_map(console, extend, images, map_images, output, force, stages, seed)
-        photographs, start = extended.folder, extended.scene
+        extended = extend_map(console, extend, images, map_images, output, force, stages, seed, options.masks)
+        photographs, start, options = extended.folder, extended.scene, replace(options, masks=extended.masks)
     survey = measured.read(photographs, lambda: _names_in(photographs)) if measured else None
     with work_with(console.threads):
         result = run_map(console, photographs, work, start, options, matches, survey, maps)
@@ -275,10 +275,15 @@ def _names_in(folder: Path) -> list[str]:
     return [path.relative_to(folder).as_posix() for path in image_files(folder)]
 
 
-def _masks_of(folder: Path | None, images: Path) -> "Masks | None":
+def _masks_of(folder: Path | None, images: Path, map_: Path | None) -> "Masks | None":
+    """Return the masks of photographs, and of those of the map that they extend."""
+    from groma.io import read_scene
     from groma.io.colmap.masks import Masks
 
-    return None if folder is None else Masks.of(folder, _names_in(images))
+    if folder is None:
+        return None
+    known = () if map_ is None else read_scene(map_).images.names
+    return Masks.of(folder, list(dict.fromkeys([*_names_in(images), *known])))
 
 
 def _has_noise(poses: Path | None, stated: str | None) -> bool:

@@ -118,7 +118,7 @@ def track(
     alone = console.threads == 1
     if alone or frames.camera.baseline is None:  # dense disparities of pairs pay for threads of their own
         one_opencv_thread()
-    source = FrameSource.of(sequence, camera, depth_scale=depth_scale, kind=known)
+    source = FrameSource.of(sequence, camera, masks, depth_scale=depth_scale, kind=known)
     options = TrackOptions(
         points=points, lines=lines, planes=planes, close_loops=loops, max_depth=max_depth, detector=line_detector,
         threaded=not alone,

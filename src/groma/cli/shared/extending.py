@@ -14,6 +14,7 @@ from groma.errors import InputError, OutputError
 
 if TYPE_CHECKING:
     from groma.cli.shared.console import Console
+    from groma.io.colmap.masks import Masks
     from groma.localization.extension import ExtendedModel
     from groma.localization.joining.merging import MergedModel
     from groma.localization.localizer import Localizer
@@ -38,6 +39,7 @@ def extend_map(
     force: bool,
     following: Names,
     seed: int,
+    masks: Masks | None,
 ) -> ExtendedModel:
     """Localise photographs in a map and return the joint model. ``following`` are the later stages."""
     from groma.localization.calibration import CalibrationChoice
@@ -50,7 +52,7 @@ def extend_map(
 
     def made(say: Callable[[str, int, int], None]) -> ExtendedModel:
         map_of_photographs = _localizer(map_, map_images, seed, say, warnings)
-        return extended_model(map_of_photographs, files, work, folder, CalibrationChoice(), say)
+        return extended_model(map_of_photographs, files, work, folder, CalibrationChoice(), say, masks)
 
     console.expect_stages(*DESCRIBING, LOCALIZING, *_WITH_POINTS, *following)
     extended = _with_progress(console, made, f"finished photographs are kept in {work}")
