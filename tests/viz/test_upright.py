@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Photographs of a camera that was held on its side: the page shows them, and the scene, upright."""
+"""Photographs of a camera that was held on its side: page and viewer show them, and the scene, upright."""
 
+import re
 import shutil
 
 import cv2
@@ -9,8 +10,10 @@ import pytest
 from _pages import data_of, write_page
 from _scene import exact_scene
 
-from groma.geometry import se3
+from groma.geometry import quaternion, se3
 from groma.viz.report.page import write_report
+from groma.viz.viewer.content import view_content
+from groma.viz.viewer.messages import describe_line
 
 CHROMIUM = next((path for path in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if path), "")
 
@@ -32,6 +35,33 @@ def test_photographs_taken_on_their_side_are_shown_upright(tmp_path):
     left = -se3.to_matrix(scene.cam_from_world)[:, 0, :3].sum(axis=0)
     np.testing.assert_allclose(data["view"]["up"], left / np.linalg.norm(left), atol=1e-12)
     assert [entry["turn"] for entry in data_of(write_page(tmp_path, None, scene))["images"]] == [0, 0]
+
+
+def test_the_viewer_shows_them_upright_too(tmp_path):
+    scene = exact_scene()
+    for name in scene.images.names:
+        write_on_its_side(tmp_path / name, np.full((480, 640, 3), 128, np.uint8))
+    plain, turned = view_content(scene), view_content(scene, tmp_path)
+    left = -quaternion.to_matrix(turned.camera_wxyz[:, [1, 2, 3, 0]])[..., 0]
+    mean = left.sum(axis=0)
+    np.testing.assert_allclose(mean / np.linalg.norm(mean), [0, 0, 1], atol=1e-12)
+    for image in (0, 1):  # a view from a camera has the left of its photograph on top, and its width as height
+        wxyz, opening = turned.upright_from(image)
+        axes = quaternion.to_matrix(wxyz[None, [1, 2, 3, 0]])[0]
+        np.testing.assert_allclose(-axes[:, 1], left[image], atol=1e-12)
+        assert np.isclose(np.tan(opening / 2), turned.camera_aspects[image] * np.tan(turned.camera_openings[image] / 2))
+        assert np.array_equal(plain.upright_from(image)[0], plain.camera_wxyz[image])
+    # So have the pieces of photographs around the segments of a line; white are the images of the line itself.
+    (tmp_path / "lying").mkdir()
+    for name in scene.images.names:
+        cv2.imwrite(str(tmp_path / "lying" / name), np.full((480, 640, 3), 128, np.uint8))
+    lying, upright = (
+        np.array(re.findall(r'd="M(\S+) (\S+) (\S+) (\S+)"', describe_line(content, 1, tmp_path / folder)), float)
+        for content, folder in ((plain, "lying"), (turned, ""))
+    )
+    assert len(lying) == 4  # in two photographs
+    expected = np.stack([480 - lying[:, 1], lying[:, 0], 480 - lying[:, 3], lying[:, 2]], axis=1)
+    np.testing.assert_allclose(upright, expected, atol=0.11)  # written to 0.1
 
 
 @pytest.mark.skipif(not CHROMIUM, reason="needs Chromium")

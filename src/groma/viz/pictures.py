@@ -14,10 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._counted import counted
+from groma._typing import IntArray
 from groma.bounded.images import decoded
 from groma.bounded.names import outside, stays_inside
 from groma.bounded.text import read_text
 from groma.errors import FileFormatError
+from groma.io.survey.exif import quarter_turns
 
 Picture = npt.NDArray[np.uint8]
 #: A folder of images, or image files by the names that the scene gives them.
@@ -35,6 +37,12 @@ def image_file(images: ImageFiles | None, name: str) -> Path | None:
     else:
         path = Path(images) / name if stays_inside(name) else None
     return path if path is not None and path.is_file() else None
+
+
+def turns_of(images: ImageFiles | None, names: Iterable[str]) -> IntArray:
+    """Return the quarter turns to the right (N,) that show photographs upright; 0 for none."""
+    files = (image_file(images, name) for name in names)
+    return np.array([0 if file is None else quarter_turns(file) for file in files], np.int64)
 
 
 def folder_of_images(model: str | os.PathLike[str], names: Iterable[str]) -> Path | None:

@@ -16,14 +16,13 @@ from groma import cameras
 from groma._counted import natural_key
 from groma._typing import FloatArray, IntArray
 from groma.execution import begin
-from groma.io.survey.exif import quarter_turns
 from groma.scene import Scene
 from groma.scene.line_intervals import one_line_per_interval
 from groma.scene.local_frame import up_of
 from groma.scene.table import new_index_of
 from groma.viz.drawable import Drawable
 from groma.viz.pack import pack, pack_whole, thin
-from groma.viz.pictures import ImageFiles, image_file, jpeg_address, read_picture, warn_of_names_outside
+from groma.viz.pictures import ImageFiles, image_file, jpeg_address, read_picture, turns_of, warn_of_names_outside
 from groma.viz.report.kept import Kept
 from groma.viz.report.overlays import projected_places
 
@@ -59,7 +58,7 @@ def _photographs(names: Sequence[str], images: ImageFiles | None) -> Photographs
     chosen = np.array(list(files))[thin(len(files), MAX_PHOTOS)].tolist() if files else []
     budget = PHOTO_BUDGET // max(len(chosen), 1)
     begun = {place: begin(partial(_photograph, files[place], budget)) for place in chosen}
-    turns = [quarter_turns(files[place]) if place in files else 0 for place in range(len(names))]
+    turns = turns_of(images, names).tolist()
     return Photographs(lambda: [begun[place]() if place in begun else "" for place in range(len(names))], turns)
 
 

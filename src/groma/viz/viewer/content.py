@@ -8,7 +8,7 @@ numbers are in scene units and pixels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,11 +17,13 @@ from groma.geometry import quaternion
 from groma.io.drawn import openings
 from groma.scene import Scene
 from groma.scene.line_intervals import line_pieces
+from groma.scene.local_frame import up_of
 from groma.scene.similarity import Similarity
 from groma.viz import colours as _colours
 from groma.viz.colours import Colours
 from groma.viz.drawable import Drawable, drawable, junctions
 from groma.viz.framing import OPENING, horizontal, starting_view
+from groma.viz.pictures import ImageFiles, turns_of
 from groma.viz.statistics import LineStatistics, line_statistics
 
 #: Half the size of the scene in the frame of the viewer: half the height of the initial picture, where it is centred.
@@ -72,8 +74,18 @@ class ViewContent:
     #: (N,) vertical opening, radians, and width over height.
     camera_openings: FloatArray
     camera_aspects: FloatArray
+    #: (N,) quarter turns to the right that show their photographs upright.
+    camera_turns: IntArray
     #: Initial viewpoint; it looks at the origin.
     start_position: FloatArray
+
+    def upright_from(self, image: int) -> tuple[FloatArray, float]:
+        """Return the orientation [w x y z] and the vertical opening of a view in which a photograph is upright."""
+        turns, opening = self.camera_turns[image], self.camera_openings[image]
+        roll = np.array([0.0, 0.0, -np.sin(0.25 * np.pi * turns), np.cos(0.25 * np.pi * turns)])
+        if turns % 2:
+            opening = 2.0 * np.arctan(self.camera_aspects[image] * np.tan(0.5 * opening))
+        return quaternion.multiply(self.camera_wxyz[image, [1, 2, 3, 0]], roll)[[3, 0, 1, 2]], float(opening)
 
     def line_colours(self, mode: str) -> LineColours:
         """Return the colours of the lines by one of ``LINE_MODES``."""
@@ -120,9 +132,10 @@ class ViewContent:
         return int(self.segment_line[candidates[np.argmin(depth[candidates])]])
 
 
-def view_content(scene: Scene) -> ViewContent:
-    """Compute what the viewer draws of a scene."""
-    shown = drawable(scene)
+def view_content(scene: Scene, images: ImageFiles | None = None) -> ViewContent:
+    """Compute what the viewer draws of a scene, whose photographs may have been taken with the camera on its side."""
+    turns = turns_of(images, scene.images.names)
+    shown = replace(drawable(scene), up=up_of(scene, turns))
     pieces, line = line_pieces(scene)
     frame, position = _frame(shown)
     order = np.random.default_rng(0).permutation(scene.num_points)
@@ -156,6 +169,7 @@ def view_content(scene: Scene) -> ViewContent:
         camera_centers=frame.points(scene.cam_centers_in_world),
         camera_openings=opening,
         camera_aspects=aspect,
+        camera_turns=turns,
         start_position=position,
     )
 

@@ -94,7 +94,12 @@ def _crop(content: ViewContent, row: int, images: ImageFiles | None, colour: str
         return ""
     camera = scene.images.camera_idx[image]
     size = float(scene.cameras.width[camera]), float(scene.cameras.height[camera])
-    crop = observation_crop(picture, size, seen.segment[row], content.statistics.end_residuals[row], colour)
+    ends, ways = seen.segment[row].reshape(2, 2), content.statistics.end_residuals[row]
+    for _ in range(content.camera_turns[image]):
+        picture, size = np.rot90(picture, -1), (size[1], size[0])
+        ends = np.column_stack([(size[0] or picture.shape[1]) - ends[:, 1], ends[:, 0]])
+        ways = np.column_stack([-ways[:, 1], ways[:, 0]])
+    crop = observation_crop(picture, size, ends.ravel(), ways, colour)
     return f"<div style='margin:6px 0 2px;opacity:.75'>{html.escape(scene.images.names[image])}</div>{crop}"
 
 

@@ -337,6 +337,6 @@ class SceneView:
                 self._look_from_outside(event.client)
                 camera.up_direction, camera.fov = np.array([0.0, 0.0, 1.0]), OPENING
             else:
-                camera.wxyz = self.content.camera_wxyz[image]
+                camera.wxyz, opening = self.content.upright_from(image)
                 camera.position = self.content.camera_centers[image]
-                camera.fov = float(np.clip(self.content.camera_openings[image], 0.2, 2.0))
+                camera.fov = float(np.clip(opening, 0.2, 2.0))

@@ -53,7 +53,7 @@ def open_viewer(
         raise InputError("The scene has no images, points or lines: there is nothing to look at.")
     if isinstance(images, str | os.PathLike) and not os.path.isdir(images):
         raise InputError(f"{os.fspath(images)} is not a folder of images. Check --images.")
-    content = view_content(scene)
+    content = view_content(scene, images)
     server = start_server(host, port, say)
     try:
         return SceneView(server, content, images)
