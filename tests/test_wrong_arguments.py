@@ -9,17 +9,21 @@ import numpy as np
 import pytest
 
 import groma
-from groma import io
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma import features, io
+from groma.adjustment.assemble import AssemblyOptions, assemble, disassemble
 from groma.errors import InputError
 from groma.evaluation import align_poses, score_poses
 from groma.geometry import line3, plane3, quaternion, se3, sim3
 from groma.mapping.lines.build import map_lines
 from groma.mapping.structure.find import find_structure
+from groma.problem.residuals import jacobians_of, residuals_of
 from groma.scene.synthetic import corridor, holistic
+from groma.solver.covariance.marginals import Covariances
+from groma.solver.covariance.quantities import angle_between_planes
 
 SCENE = holistic(2, seed=0).start
 CAMERA = groma.QueryCamera("SIMPLE_PINHOLE", np.array([500.0, 320.0, 240.0]), 640, 480)
+COVARIANCES = Covariances(assemble(SCENE, AssemblyOptions()).problem)
 PIXELS, PLACES = np.zeros((4, 2)), np.ones((4, 3))
 TAKE_SCENES = {
     "adjust": groma.adjust,
@@ -86,6 +90,23 @@ def test_a_path_or_a_result_is_no_scene(function, tmp_path, monkeypatch):
         (lambda: groma.cameras.model(1), "name must be a str; got int"),  # type: ignore[arg-type]
         (lambda: holistic(4, noise_px=float("nan")), "noise_px must be a standard deviation, 0 or more; got nan"),
         (lambda: holistic(4, structure=-1.0), "structure must be a standard deviation, 0 or more; got -1"),
+        (lambda: holistic("four"), "num_images must be an int or integer; got str"),  # type: ignore[arg-type]
+        (lambda: corridor(None), "size must be an int or integer; got NoneType.*or one of"),  # type: ignore[arg-type]
+        (lambda: disassemble(SCENE, SCENE), "problem must be a Problem; got Scene"),  # type: ignore[arg-type]
+        (lambda: Covariances(SCENE), "problem must be a Problem; got Scene"),  # type: ignore[arg-type]
+        (lambda: angle_between_planes(SCENE, ("planes", 0), ("planes", 1)), "covariances must be a Covariances"),  # type: ignore[arg-type]
+        (lambda: angle_between_planes(COVARIANCES, 0, 1), r"A variable must be a tuple; got int\. Pass \(group"),  # type: ignore[arg-type]
+        (lambda: residuals_of(SCENE, {}), "factor must be a Factor; got Scene"),  # type: ignore[arg-type]
+        (lambda: jacobians_of("a", {}), "factor must be a Factor; got str"),  # type: ignore[arg-type]
+        (lambda: groma.QueryCamera.of(SCENE, 0), r"table must be a Cameras; got Scene\. Pass scene\.cameras"),  # type: ignore[arg-type]
+        (lambda: groma.cameras.in_model(np.ones(4), "PINHOLE", "OPENCV"), "old must be a CameraModel; got str"),  # type: ignore[arg-type]
+        (lambda: groma.cameras.register_camera("MINE", None, None, None), "camera must be a CameraModel; got str"),  # type: ignore[arg-type]
+        (lambda: io.register_format("ply"), "scene_format must be a SceneFormat; got str"),  # type: ignore[arg-type]
+        (lambda: io.sequences.register_layout("folder"), "layout must be a SequenceLayout; got str"),  # type: ignore[arg-type]
+        (lambda: features.nearby_points(PIXELS, PIXELS, np.arange(4)), "segments must be a Segments; got ndarray"),  # type: ignore[arg-type]
+        (lambda: features.match_wide_baseline(SCENE, SCENE, PIXELS, PIXELS), "segments_1 must be a Segments; got Sc"),  # type: ignore[arg-type]
+        (lambda: features.fundamental_from_poses(*[np.eye(3)] * 4), r"cam1_from_world must have shape \(..., 3, 4\)"),
+        (lambda: features.write_matches("a.npz", {}), "external must be an ExternalMatches; got dict"),  # type: ignore[arg-type]
         (lambda: corridor(12, noise_px=float("inf")), "noise_px must be a standard deviation, 0 or more; got inf"),
     ],
 )

@@ -61,7 +61,7 @@ def check_kind(value: object, kinds: type | tuple[type, ...], name: str, way: st
     """Raise InputError unless the argument ``name`` is of a kind; ``way`` is a sentence that says how to get one."""
     if not isinstance(value, kinds):
         wanted = " or ".join(kind.__name__ for kind in (kinds if isinstance(kinds, tuple) else (kinds,)))
-        article = "an" if wanted[0] in "AEIOU" else "a"
+        article = "an" if wanted[0] in "AEIOUaeiou" else "a"
         raise InputError(f"{name} must be {article} {wanted}; got {type(value).__name__}. {way}")
 
 

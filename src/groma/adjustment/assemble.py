@@ -152,6 +152,8 @@ def gauge_of(scene: Scene, options: AssemblyOptions) -> str:
 
 def disassemble(scene: Scene, problem: Problem) -> Scene:
     """Return the scene with the states of a solved problem."""
+    check_scene_given(scene)
+    check_kind(problem, Problem, "problem", "Make one: assemble(scene, options).")
     states = {name: group.state for name, group in problem.variables.items()}
     params = scene.cameras.params.copy()
     for name, members in scene.cameras.by_model().items():

@@ -7,7 +7,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.cameras.contract import CameraModel
-from groma.errors import InputError
+from groma.errors import InputError, check_kind
 
 #: A camera is the same in another model if no pixel of a grid moves by more, pixels.
 SAME_PIXEL = 1e-6
@@ -30,6 +30,8 @@ def in_model(params: FloatArray, old: CameraModel, new: CameraModel, size: Float
     InputError
         If the new model would see the world at other pixels.
     """
+    for name, model in (("old", old), ("new", new)):
+        check_kind(model, CameraModel, name, 'Pass a camera model: groma.cameras.model("PINHOLE").')
     values = {_word(name): value for name, value in zip(old.parameter_names, params, strict=True)}
     found = np.array([values.get(_word(name), 0.0) for name in new.parameter_names])
     focals = params[list(old.focal_indices)] if old.focal_indices else np.ones(1)

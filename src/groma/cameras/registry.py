@@ -49,6 +49,7 @@ def register_camera(
     InputError
         If the name belongs to a model of another module.
     """
+    check_kind(camera, CameraModel, "camera", "Pass a CameraModel, the first argument, then its kernels.")
     known = _MODELS.get(camera.name)
     if known is not None and kernel_module(known.number + 1) != project.__module__:
         raise InputError(

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groma.bounded.arrays import opened_arrays
-from groma.errors import FileFormatError, GromaError, OutputError
+from groma.errors import FileFormatError, GromaError, OutputError, check_kind
 from groma.features.edge_fit import measure_edges
 from groma.features.images import to_gray
 from groma.features.matches import LineMatches
@@ -120,7 +120,7 @@ def write_matches(path: str | Path, external: ExternalMatches, force: bool = Fal
     Parameters
     ----------
     path : path
-        Where the file goes. Its folder must exist.
+        Where the file goes.
     external : ExternalMatches
         Segments and matches.
     force : bool
@@ -131,6 +131,7 @@ def write_matches(path: str | Path, external: ExternalMatches, force: bool = Fal
     OutputError
         If something is there and ``force`` is False, or if the file system refuses.
     """
+    check_kind(external, ExternalMatches, "external", "Make one: ExternalMatches(segments, matches).")
     path = Path(path)
     if not force and (path.exists() or path.is_symlink()):
         raise OutputError(f"{path} exists already. Pass force=True to replace it, or choose another name.")

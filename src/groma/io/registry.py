@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from groma.bounded.names import existing
-from groma.errors import FileFormatError, GromaError, InputError
+from groma.errors import FileFormatError, GromaError, InputError, check_kind
 from groma.io.g2o import looks_like_g2o
 from groma.io.reading import reading
 from groma.io.trajectories import read_trajectory
@@ -66,6 +66,7 @@ def register_format(scene_format: SceneFormat) -> SceneFormat:
     InputError
         If the name belongs to another format.
     """
+    check_kind(scene_format, SceneFormat, "scene_format", "Make one: SceneFormat(...).")
     known = _FORMATS.setdefault(scene_format.name, scene_format)
     if known is not scene_format and _home(known) != _home(scene_format):
         raise InputError(

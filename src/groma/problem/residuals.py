@@ -9,6 +9,7 @@ import numpy as np
 
 from groma._rows import pointers_of
 from groma._typing import FloatArray
+from groma.errors import check_kind
 from groma.factors.contract import Factor
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
@@ -19,6 +20,7 @@ def residuals_of(factor: Factor, variables: Mapping[str, Variables]) -> FloatArr
 
     Degenerate factors have a residual of zero.
     """
+    check_kind(factor, Factor, "factor", "Pass a group of factors, such as one of Problem.factors.")
     residuals = np.zeros((len(factor), factor.residual_size))
     if len(factor):
         ambients = tuple(variables[ref.group].ambient() for _, ref in factor.references())
@@ -62,6 +64,7 @@ def jacobians_of(factor: Factor, variables: Mapping[str, Variables]) -> dict[str
         and without the loss; variables held constant have theirs too; degenerate factors have zeros. Where two slots
         refer to the same variable, its derivative is the sum of both blocks.
     """
+    check_kind(factor, Factor, "factor", "Pass a group of factors, such as one of Problem.factors.")
     references = factor.references()
     groups = [variables[ref.group] for _, ref in references]
     begin = pointers_of([group.manifold.factor_columns for group in groups])

@@ -15,6 +15,7 @@ from functools import reduce
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.errors import check_kind
 from groma.factors.contract import Factor, Ref
 from groma.problem._partition import LANDMARK_KINDS, free_groups
 from groma.problem.problem import Problem
@@ -102,6 +103,7 @@ class Divided:
 
 def with_tied_apart(problem: Problem, eliminate: str | tuple[str, ...] = "auto") -> Divided:
     """Return the problem with the landmarks that must be kept apart; as it is where it is said what to eliminate."""
+    check_kind(problem, Problem, "problem", "Make one: groma.Problem(variables, factors).")
     tied = find_tied(problem) if eliminate == "auto" else []
     return Divided(reduce(lambda whole, group: group.divide(whole), tied, problem), tuple(tied))
 

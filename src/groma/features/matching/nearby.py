@@ -11,8 +11,9 @@ import numpy.typing as npt
 from groma._numba import loop
 from groma._rows import pointers_of
 from groma._typing import FloatArray, IntArray
-from groma.errors import ShapeError
+from groma.errors import ShapeError, check_kind
 from groma.features.segments import Segments
+from groma.geometry.algebra import numbers
 
 
 @dataclass(frozen=True)
@@ -70,8 +71,8 @@ def nearby_points(segments: Segments, points: FloatArray, point_ids: IntArray, r
     reach : float
         Half width of the box on either side, pixels; it reaches half as far beyond the end points.
     """
-    points = np.ascontiguousarray(points, dtype=np.float64)
-    point_ids = np.asarray(point_ids, dtype=np.int64)
+    check_kind(segments, Segments, "segments", "Detect them: groma.features.LsdDetector().detect(image).")
+    points, point_ids = np.ascontiguousarray(numbers(points, "points")), np.asarray(point_ids, dtype=np.int64)
     if points.ndim != 2 or points.shape[1] != 2 or point_ids.shape != (len(points),):
         raise ShapeError(f"points must have shape (P, 2) and point_ids (P,); got {points.shape} and {point_ids.shape}.")
     order = np.argsort(point_ids, kind="stable")

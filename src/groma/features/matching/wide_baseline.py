@@ -35,12 +35,13 @@ import numpy.typing as npt
 
 from groma._numba import inline_kernel, kernel, loop
 from groma._typing import FloatArray, IntArray
-from groma.errors import InputError, ShapeError, given_or_default
+from groma.errors import InputError, ShapeError, check_kind, given_or_default
 from groma.features.matches import LineMatches, mutual_best
 from groma.features.matching.descriptor import Descriptors
 from groma.features.matching.nearby import NearbyPoints, nearby_points
 from groma.features.segments import SEGMENTS, Segments
 from groma.gates import gate
+from groma.geometry.algebra import matrices, numbers
 
 #: Rows of the table of descriptor products held in memory (cost: memory).
 ROWS_AT_ONCE = 512
@@ -337,6 +338,10 @@ def fundamental_from_poses(
     (3, 3) float64
         Zero where the camera centres coincide.
     """
+    cam1_from_world, cam2_from_world = (
+        matrices(pose, 3, 4, f"cam{n}_from_world") for n, pose in ((1, cam1_from_world), (2, cam2_from_world))
+    )
+    K1, K2 = matrices(K1, 3, 3, "K1"), matrices(K2, 3, 3, "K2")
     R = cam2_from_world[:, :3] @ cam1_from_world[:, :3].T
     t = cam2_from_world[:, 3] - R @ cam1_from_world[:, 3]
     cross = np.array([[0.0, -t[2], t[1]], [t[2], 0.0, -t[0]], [-t[1], t[0], 0.0]])
@@ -344,7 +349,8 @@ def fundamental_from_poses(
 
 
 def _descriptors(descriptors: Descriptors, segments: Segments, which: int) -> npt.NDArray[np.float32]:
-    descriptors = np.ascontiguousarray(descriptors, dtype=np.float32)
+    check_kind(segments, Segments, f"segments_{which}", "Detect them: groma.features.LsdDetector().detect(image).")
+    descriptors = np.ascontiguousarray(numbers(descriptors, f"descriptors_{which}"), dtype=np.float32)
     if descriptors.ndim != 2 or len(descriptors) != len(segments):
         raise ShapeError(
             f"descriptors_{which} must have shape ({len(segments)}, D), one row a segment; got {descriptors.shape}."

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from groma.errors import InputError
+from groma.errors import InputError, check_kind
 from groma.io.sequences._calibration import Calibration
 from groma.io.sequences._reader import Selection
 from groma.io.sequences.frame import Sequence
@@ -49,6 +49,7 @@ def register_layout(layout: SequenceLayout) -> SequenceLayout:
     InputError
         If the name belongs to another layout.
     """
+    check_kind(layout, SequenceLayout, "layout", "Make one: SequenceLayout(...).")
     known = _LAYOUTS.get(layout.name, layout)
     if known.open.__module__ != layout.open.__module__:
         raise InputError(f"A sequence layout named {layout.name!r} is registered already. Choose another name.")

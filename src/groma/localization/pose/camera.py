@@ -11,7 +11,7 @@ import numpy.typing as npt
 from groma import cameras
 from groma._typing import FloatArray
 from groma.cameras import CameraModel
-from groma.errors import InputError
+from groma.errors import InputError, check_kind
 from groma.geometry.charts.pose_charts import POSE_CHARTS
 from groma.scene import Cameras
 
@@ -87,6 +87,7 @@ class QueryCamera:
     @staticmethod
     def of(table: Cameras, row: int) -> QueryCamera:
         """One camera of a scene."""
+        check_kind(table, Cameras, "table", "Pass scene.cameras.")
         return QueryCamera(table.models[row], table.params_of(row), int(table.width[row]), int(table.height[row]))
 
 

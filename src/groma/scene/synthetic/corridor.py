@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.errors import InputError
+from groma.errors import InputError, check_kind
 from groma.geometry import quaternion
 from groma.scene.camera import Cameras
 from groma.scene.landmarks import Lines
@@ -86,6 +86,7 @@ def corridor(
             raise InputError(f"size must be a number of images or one of {', '.join(SIZES)}; got {size!r}.")
         numbers = SIZES[size]
     else:
+        check_kind(size, (int, np.integer), "size", f"Pass a number of images, or one of {', '.join(SIZES)}.")
         if size < 2:
             raise InputError(f"size must be at least 2 images; got {size}.")
         numbers = (size, 100 * size, 40 * size, 16 * max(1, round(size / 75)), 9, 8)

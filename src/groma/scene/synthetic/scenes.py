@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.errors import InputError
+from groma.errors import InputError, check_kind
 from groma.geometry import quaternion
 from groma.scene.camera import Cameras
 from groma.scene.landmarks import Lines
@@ -73,6 +73,7 @@ def holistic(
     ----------
     arXiv 2609.04026, appendix A.3.
     """
+    check_kind(num_images, (int, np.integer), "num_images", "Pass a number of images.")
     if num_images < 2:
         raise InputError(f"num_images must be at least 2; got {num_images}.")
     if views not in ("random", "near"):

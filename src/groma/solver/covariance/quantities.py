@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.errors import InputError
+from groma.errors import InputError, check_kind
 from groma.solver.covariance.marginals import Covariances, Variable
 
 
@@ -145,7 +145,10 @@ def _center(T: FloatArray) -> FloatArray:
 
 
 def _check(covariances: Covariances, variables: tuple[Variable, ...], kinds: tuple[str, ...]) -> None:
-    for (group, _), kind in zip(variables, kinds, strict=True):
+    check_kind(covariances, Covariances, "covariances", "Make them of a problem: Covariances(problem).")
+    for variable, kind in zip(variables, kinds, strict=True):
+        check_kind(variable, tuple, "A variable", "Pass (group, index).")
+        group = variable[0]
         known = covariances.problem.variables
         if group not in known or known[group].manifold.kind != kind:
             found = known[group].manifold.kind if group in known else "no group"
