@@ -252,6 +252,10 @@ def test_narrow_pieces_turned_alike_do_not_outvote_a_wide_one(turns, leans):
     pieces.planes[:, 0] = slope
     whole = pieces_of(marks, [0.0], [np.ones(1200, bool)])
     assert _leans(whole, pieces, [0, 1, 2, 3]) == leans
+    # One on a single line says nothing of how the wall is turned about that.
+    on_line = np.linspace(0.0, 1.0, 8)[:, None] * [0.0, 1.0, 0.0] + [0.25, 0.0, 0.0]
+    places = replace(pieces, places=(*pieces.places[:3], on_line))
+    assert _leans(whole, places, [0, 1, 2, 3]) == leans
 
 
 def test_landmarks_that_a_joined_plane_does_not_pass_through_are_free_again():

@@ -203,7 +203,8 @@ def _leans(whole: PlaneSet, planes: PlaneSet, group: list[int]) -> bool:
     """
     basis = np.stack(perpendicular(whole.planes[0, :3]))
     turned, noise = _turned(basis, planes, group)
-    scatter = [np.cov(planes.places[b] @ basis.T, rowvar=False) for b in group]
+    scatter = np.array([np.cov(planes.places[b] @ basis.T, rowvar=False) for b in group])
+    scatter += 1e-12 * np.trace(scatter, axis1=1, axis2=2)[:, None, None] * np.eye(2)  # places may be on one line
     shape = np.asarray(np.linalg.inv(scatter), dtype=np.float64)
     information = np.linalg.inv(noise + _spread(turned, noise, shape, 2 * len(group) - 2) * shape)
     known = np.linalg.inv(information.sum(axis=0))
