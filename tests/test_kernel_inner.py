@@ -327,6 +327,5 @@ def test_machine_code_is_the_same_whatever_was_compiled_before(tmp_path):
     expected = run("fresh", "1", "total")
     assert len(expected.split()) > 100
     assert run("called before", "2", "copied", "counted", "total") == expected
-    run("kept by others", "3", "counted")
-    run("kept by others", "4", "copied")
-    assert run("kept by others", "5", "total") == expected
+    run("kept by others", "3", "counted", "copied")
+    assert run("kept by others", "4", "total") == expected

@@ -120,7 +120,8 @@ def test_refuses_what_does_not_belong_together(scene, tmp_path):
 def test_landmarks_alone_are_adjusted_in_parts(scene, tmp_path, loss):
     """With cameras held nothing is shared: what landmarks have left to gain still counts."""
     scene = scene.points_only()
-    paths = write_parts(scene, tmp_path / "parts", observations=150)
+    paths = write_parts(scene, tmp_path / "parts", observations=300)
+    assert len(paths) > 1
     options = SolverOptions(function_tolerance=1e-9, max_iterations=300, threads=1)
     result = adjust_parts(paths, tmp_path / "out", loss=loss, options=options, refine_poses=False)
     told = groma.AdjustOptions(

@@ -96,10 +96,11 @@ def kill_and_go_on(command: str, given: Callable[[str], list[str]], home: Path, 
     assert not (home / "out.work").exists()
 
 
-MAP = pytest.param("map", marks=pytest.mark.slow)  # killed at chosen moments in tests/mapping
+# Killed at chosen moments in tests/mapping and tests/tracking.
+LONGER = [pytest.param(name, marks=pytest.mark.slow) for name in ("map", "track")]
 
 
-@pytest.mark.parametrize("command", ["adjust", MAP, "track"])
+@pytest.mark.parametrize("command", ["adjust", *LONGER])
 def test_killed_at_random_moments(command, given, tmp_path):
     kill_and_go_on(command, given, tmp_path, kills=2, seed=0)
 

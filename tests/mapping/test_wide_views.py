@@ -109,7 +109,7 @@ def test_an_edge_across_the_border_of_a_panorama_goes_on():
     np.testing.assert_allclose(views.to_view(back, rays).ravel(), ends[0], atol=1e-9)
 
 
-@pytest.mark.parametrize("camera", [PANORAMA, FISHEYE])
+@pytest.mark.parametrize("camera", [pytest.param(PANORAMA, marks=pytest.mark.slow), FISHEYE])
 def test_a_room_is_mapped(tmp_path, camera):
     scene, edges = _room.room(tmp_path / "images", camera, count=6)
     result = map_images(tmp_path / "images", tmp_path / "work", scene, MapOptions(threads=1))

@@ -39,9 +39,8 @@ def _tracked(frames, ahead: bool, **options):
 @pytest.mark.parametrize("kind", ["rgbd", "stereo"])
 def test_threads_and_frames_known_ahead_change_no_bit(kind):
     frames = _with_a_jump(kind)
-    (rows, alone), *others = [
-        _tracked(frames, ahead, threaded=threaded) for ahead, threaded in ((False, False), (False, True), (True, True))
-    ]
+    ways = [(False, False), (False, True), (True, True)] if kind == "rgbd" else [(False, False), (True, True)]
+    (rows, alone), *others = [_tracked(frames, ahead, threaded=threaded) for ahead, threaded in ways]
     assert sum(row.keyframe for row in rows) >= 2
     assert any("find" in row.timings for row in rows)
     for other_rows, other in others:

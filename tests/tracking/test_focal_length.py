@@ -10,9 +10,16 @@ import pytest
 from groma.tracking import Tracker, TrackOptions
 
 
-@pytest.mark.parametrize(("factor", "turns", "told"), [(1.0, True, False), (1.15, True, True), (1.15, False, False)])
 @pytest.mark.parametrize(
-    ("kind", "count", "turn", "step"), [("stereo", 16, 0.06, 0.04), ("mono", 30, 0.03, 0.06)], ids=["stereo", "mono"]
+    ("kind", "count", "turn", "step", "factor", "turns", "told"),
+    [
+        ("stereo", 16, 0.06, 0.04, 1.0, True, False),
+        ("stereo", 16, 0.06, 0.04, 1.15, True, True),
+        ("stereo", 16, 0.06, 0.04, 1.15, False, False),
+        ("mono", 30, 0.03, 0.06, 1.0, True, False),
+        ("mono", 30, 0.03, 0.06, 1.15, True, True),
+        pytest.param("mono", 30, 0.03, 0.06, 1.15, False, False, marks=pytest.mark.slow),
+    ],
 )
 def test_a_wrong_focal_length_is_told_where_the_camera_turns(kind, count, turn, step, factor, turns, told):
     camera = _room.camera(_room.BASELINE if kind == "stereo" else None)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """``groma view --live`` in a real browser: the picture, the status and the timeline appear, and switches work.
 
-Needs Chromium and Playwright (its Python package; the browser is that of the system).
+Needs Chromium and Playwright (its Python package; the browser is that of the system). Drawing without a graphics card
+takes 17 seconds of a processor; ``test_live.py`` shows what the server sends.
 """
 
 import shutil
@@ -15,7 +16,7 @@ from groma.viz.viewer import live
 
 CHROMIUM = next((path for path in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if path), "")
 playwright = pytest.importorskip("playwright.sync_api", reason="needs Playwright: pip install playwright")
-pytestmark = pytest.mark.skipif(not CHROMIUM, reason="needs Chromium")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(not CHROMIUM, reason="needs Chromium")]
 
 
 def test_a_running_track_in_the_browser(tmp_path):

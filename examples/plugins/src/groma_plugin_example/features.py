@@ -30,18 +30,18 @@ class HoughDetector:
         length = np.hypot(*(ends[:, 2:] - ends[:, :2]).T)
         kept = []
         for row in np.argsort(-length, kind="stable"):
-            if not any(_same_edge(ends[row], ends[other]) for other in kept):
+            if not _is_along_one(ends[row], ends[kept]):
                 kept.append(row)
         ends, sigma, strength = measure_edges(gray, ends[kept[: self.max_segments or None]])
         good = np.hypot(*(ends[:, 2:] - ends[:, :2]).T) >= self.min_length
         return Segments(ends[good], sigma[good], strength[good])
 
 
-def _same_edge(short, long):
-    """Whether both ends of a segment lie within two pixels of a longer one."""
-    along = (long[2:] - long[:2]) / np.hypot(*(long[2:] - long[:2]))
-    offset = short.reshape(2, 2) - long[:2]
-    return bool((np.abs(offset[:, 0] * along[1] - offset[:, 1] * along[0]) < 2.0).all())
+def _is_along_one(short, others):
+    """Whether both ends of a segment lie within two pixels of one of the others (n, 4)."""
+    along = (others[:, 2:] - others[:, :2]) / np.hypot(*(others[:, 2:] - others[:, :2]).T)[:, None]
+    offset = short.reshape(2, 1, 2) - others[:, :2]
+    return bool((np.abs(offset[..., 0] * along[:, 1] - offset[..., 1] * along[:, 0]) < 2.0).all(axis=0).any())
 
 
 @dataclass(frozen=True)
