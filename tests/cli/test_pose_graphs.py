@@ -30,8 +30,9 @@ def graph(tmp_path):
 def test_the_graph_is_adjusted_and_written(graph, tmp_path, capsys):
     out = tmp_path / "out.g2o.gz"
     assert run(["adjust", str(graph), "-o", str(out), "--json", str(tmp_path / "report.json")]) == 0
-    head, *rows = (line.split() for line in capsys.readouterr().out.splitlines()[:5])
-    assert (head, rows[:2], rows[3][0]) == (["number"], [["poses", "8"], ["motions", "9"]], "Cost")
+    said = [line.split() for line in capsys.readouterr().out.splitlines()]
+    rows = said[said.index(["number"]) + 1 :]  # where nothing is compiled yet, that comes first
+    assert (rows[:2], rows[3][0]) == ([["poses", "8"], ["motions", "9"]], "Cost")
     assert rows[2][:-1] == "noise, times that of the file".split() and float(rows[2][-1]) < 1e-4
     numbers = json.loads((tmp_path / "report.json").read_text())
     assert numbers["num_poses"] == 8 and numbers["num_motions"] == 9 and numbers["converged"]
