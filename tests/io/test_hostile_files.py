@@ -22,7 +22,7 @@ from groma.io import read_scene, read_tum, write_archive, write_colmap
 from groma.scene import Scene
 
 BAL = Path(__file__).parents[1] / "data" / "bal"
-EXAMPLES = settings(max_examples=200)
+EXAMPLES = settings(max_examples=100)
 
 NUMBERS = [struct.pack("<d", value) for value in (float("nan"), float("inf"), 1e308, -1.0, 0.0)]
 NUMBERS += [struct.pack("<Q", value) for value in (2**64 - 1, 2**63, 2**40, 2**31, 2**20, 0, 1)]

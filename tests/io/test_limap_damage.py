@@ -91,7 +91,7 @@ def test_damaged_files_give_a_scene_or_an_error(tmp_path, form):
     source = {path: path.read_bytes() for folder in folders for path in folder.iterdir()}
     assert any(path.name == "groma.npz" for path in source)
 
-    @settings(max_examples=200)
+    @settings(max_examples=100)
     @given(
         st.sampled_from(sorted(source)),
         st.sampled_from(["truncate", "flip", "overwrite", "insert", "remove"]),

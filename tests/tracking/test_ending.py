@@ -197,7 +197,7 @@ def test_maps_are_joined_at_the_end_where_they_saw_the_same_place(monkeypatch):
     """While tracking no place is looked for: the camera jumps to the opposite wall, and turns back."""
     monkeypatch.setattr(Mapper, "_what_to_search", lambda self: None)
     poses = [_turned(1.5 * k, 0.02 * k) for k in range(10)] + [_turned(180, 0.1 + 0.01 * k) for k in range(20)]
-    poses = np.array(poses + [_turned(180 - 6 * k, 0.3) for k in range(1, 30)])
+    poses = np.array(poses + [_turned(180 - 9 * k, 0.3) for k in range(1, 20)])
     tracker = Tracker(_room.camera(), OPTIONS)
     rows = [tracker.process(frame) for frame in _room.frames("rgbd", poses)]
     assert {row.submap for row in rows} == {0, 1}

@@ -263,7 +263,7 @@ def _to_the_opposite_wall() -> tuple[np.ndarray, np.ndarray]:
     there = np.array(
         [_turned(1.5 * k, 0.02 * k) for k in range(10)] + [_turned(180, 0.1 + 0.01 * k) for k in range(24)]
     )
-    back = np.array([_turned(180 - 6 * k, 0.3) for k in range(1, 30)] + [_turned(4 - 0.5 * k, 0.3) for k in range(8)])
+    back = np.array([_turned(180 - 9 * k, 0.3) for k in range(1, 20)] + [_turned(4 - 0.5 * k, 0.3) for k in range(8)])
     return there, back
 
 

@@ -49,7 +49,7 @@ def _worst(rows, poses: np.ndarray) -> tuple[float, float]:
     return float(shift.max()), float(np.degrees(turn.max()))
 
 
-@pytest.mark.parametrize("degrees", [10, 18, 25])
+@pytest.mark.parametrize("degrees", [*(pytest.param(less, marks=pytest.mark.slow) for less in (10, 18)), 25])
 def test_a_swinging_depth_camera(degrees):
     poses = _swing(degrees)
     tracker = Tracker(_room.camera(), OPTIONS)
