@@ -325,9 +325,17 @@ def test_the_command_extends_a_map(place, truth, tmp_path, capsys):
     (tmp_path / "new").mkdir()
     for name in HALVES["b"][1:4]:
         shutil.copy(place / "b" / name, tmp_path / "new")
+    masked = [HALVES["a"][0], HALVES["b"][1]]  # one of the map, one of the new ones
+    (tmp_path / "masks").mkdir()
+    for name in masked:
+        mask = np.repeat(np.uint8([[0]] * 40 + [[255]] * 440), 640, axis=1)
+        cv2.imwrite(str(tmp_path / "masks" / f"{name}.png"), mask)
     given = ["map", tmp_path / "new", "--extend", place / "a.npz", "--map-images", place / "a", "-o", out]
-    assert run([*map(str, given), "--no-diagnosis", "--no-planes"]) == 0
+    assert run([*map(str, given), "--no-diagnosis", "--no-planes", "--masks", str(tmp_path / "masks")]) == 0
+    assert "Masks leave out 8.3 % of 2 photographs; 5 have none." in " ".join(capsys.readouterr().out.split())
     scene = read_scene(out / "scene.npz")
+    seen, row = scene.point_observations, scene.images.names.index(masked[1])
+    assert (seen.image_idx == row).sum() > 10 and (seen.pixel[seen.image_idx == row, 1] > 39.0).all()
     assert sorted(scene.images.names) == sorted([*HALVES["a"], *HALVES["b"][1:4]])
     # The result is in the world of the map, and can be extended or asked itself.
     assert np.median(_off(scene, truth)) < 0.1
