@@ -115,8 +115,8 @@ def _gzip_of(line: bytes, size: int) -> bytes:
 
 def _npz_of(folder: Path, files: dict[str, list[tuple[str, tuple[int, ...], str]]]) -> None:
     """Write archives of zeros, in a process of its own: the memory of this one is inherited by those it starts."""
-    made = "{k: np.zeros(s, t) for k, s, t in arrays}"
-    code = f"import numpy as np, sys\nfor name, arrays in eval(sys.argv[1]).items(): np.savez_compressed(name, **{made})"
+    save = "np.savez_compressed(name, **{k: np.zeros(s, t) for k, s, t in arrays})"
+    code = f"import numpy as np, sys\nfor name, arrays in eval(sys.argv[1]).items(): {save}"
     subprocess.run([sys.executable, "-c", code, repr(files)], check=True, cwd=folder)
 
 

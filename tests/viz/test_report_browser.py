@@ -34,6 +34,9 @@ WHERE = """([x, y, z]) => {
   return [box.left + p[0] / ratio, box.top + p[1] / ratio];
 }"""
 
+#: The fragment of a page without WebGL, which takes seconds without a graphics card.
+FLAT = "#canvas"
+
 
 @pytest.fixture(scope="module")
 def browser():
@@ -109,7 +112,7 @@ def _click(page, place) -> None:
 
 def test_the_page_lists_the_photographs(opened, scene):
     """Its script has run."""
-    found = opened().locator("#image option").all_text_contents()
+    found = opened(FLAT).locator("#image option").all_text_contents()
     assert [name for name in scene.images.names if any(name in text for text in found)] == list(scene.images.names)
 
 
@@ -201,7 +204,7 @@ def test_a_junction_lights_up_both_lines(opened, scene):
 
 
 def test_search_by_name(opened, scene):
-    page = opened()
+    page = opened(FLAT)
     # A few of the names that go on after what is typed, and first.jpg, second.jpg.
     assert page.evaluate("search('p').map(found => found.kind)") == ["plane", *["point"] * 7, "camera", "camera"]
     size = page.locator("#scene").bounding_box()
@@ -228,7 +231,7 @@ def _measured(page) -> dict[str, str]:
 
 
 def test_distance_of_two_points_with_its_standard_deviation(opened, scene, covariances):
-    page = opened()
+    page = opened(FLAT)
     page.click("#measure")
     _only(page, "points")
     for point in (3, 9):
@@ -245,7 +248,7 @@ def test_distance_of_two_points_with_its_standard_deviation(opened, scene, covar
 
 def test_angle_of_two_lines_with_its_standard_deviation(opened, scene, covariances):
     """Against the derivative of the angle by the directions, taken numerically."""
-    page = opened()
+    page = opened(FLAT)
     page.click("#measure")
     _only(page, "lines")
     for line in (1, 3):
@@ -268,7 +271,7 @@ def test_angle_of_two_lines_with_its_standard_deviation(opened, scene, covarianc
 
 def test_distance_of_a_line_from_a_point_uses_moments_about_the_offset(opened, scene, covariances):
     """The page works in coordinates less an offset; the spread across a line comes out as from the world's moments."""
-    page = opened()
+    page = opened(FLAT)
     page.click("#measure")
     line, point = 2, 6
     at = _middle(scene, line)
@@ -389,7 +392,7 @@ def test_what_makes_single_frames_wait_hides_nothing(opened):
 
 def test_the_glide_follows_the_clock(opened):
     """However few frames there are."""
-    page = opened()
+    page = opened(FLAT)
     glides = "took => { [blend, target, glided] = [0, 1, 0]; for (const time of took) glide(time); return blend; }"
     many, few = (page.evaluate(glides, list(range(10, 101, step))) for step in (10, 90))
     assert many == pytest.approx(few, abs=1e-9)
