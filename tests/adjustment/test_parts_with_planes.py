@@ -202,7 +202,6 @@ def test_convert_cuts_and_joins(scene, tmp_path, capsys):
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
-@pytest.mark.slow  # what ranks send each other is shown without planes in test_parts_by_mpi.py
 @needs_mpi
 def test_two_ranks_write_what_one_process_writes(scene, tmp_path):
     """Relations of all kinds, in two robust stages; what travels has blocks between planes and cameras."""

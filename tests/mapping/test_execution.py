@@ -197,7 +197,6 @@ def test_lines_do_not_depend_on_who_maps_them(make):
     same_lines_as_alone(make())
 
 
-@pytest.mark.slow  # to us an executor like the others
 @pytest.mark.skipif(importlib.util.find_spec("mpi4py") is None, reason="mpi4py is not installed")
 def test_lines_mapped_by_mpi():
     mpiexec = shutil.which("mpiexec", path=sysconfig.get_path("scripts")) or shutil.which("mpiexec")
@@ -210,7 +209,6 @@ def test_lines_mapped_by_mpi():
     assert said.stdout.split() == ["2", "workers", "agree"]
 
 
-@pytest.mark.slow  # to us an executor like the others
 @pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="dask.distributed is not installed")
 def test_lines_mapped_by_dask():
     from distributed import Client
