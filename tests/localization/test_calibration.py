@@ -71,4 +71,4 @@ def test_a_query_is_compared_with_a_photograph_of_its_size(tmp_path):
     map_ = _Map(files)
     assert Localizer.photograph_of_map(map_, 10, 10) is None
     run._localize(map_, "query.jpg", _photograph(tmp_path / "query.jpg", 24), CalibrationChoice(), None)
-    assert map_.asked == [(OF_MAP, False)]
+    assert map_.asked == [(None, False)]  # that of the map

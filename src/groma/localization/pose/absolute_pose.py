@@ -131,7 +131,7 @@ class AbsolutePose:
     contradicted: bool = False
     #: Whether all features near the pose say so, however it was found: more matches to find one by change nothing.
     settled: bool = False
-    other_focal: bool = False  # whether that is another focal length than was given
+    other_focal: bool = False  #: Whether that is another focal length than was given.
 
     @property
     def center(self) -> FloatArray | None:
