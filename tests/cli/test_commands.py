@@ -56,6 +56,7 @@ def test_page_of_an_adjustment_shows_the_photographs(scenes, here):
 
 def test_the_photographs_of_a_project_are_its_images(scenes, here, capsys):
     """Masks and depths beside them are none; a picture in the folder, or a model of its names, says otherwise."""
+    (here / "site" / "sparse").mkdir(parents=True)
     for kind in ("images", "masks", "depth"):
         (here / "site" / kind).mkdir(parents=True)
         for number in range(2):
@@ -63,7 +64,13 @@ def test_the_photographs_of_a_project_are_its_images(scenes, here, capsys):
     assert run(["map", "site", "-o", "out"]) == 1
     said = capsys.readouterr()
     assert f"Photographs: {os.path.join('site', 'images')};" in said.out and "holds 2 images" in said.err
+    assert "is not used" not in said.out
     scene = read_scene(scenes / "points.npz")
+    write_scene(scene, here / "site" / "sparse" / "0")
+    assert run(["map", "site", "-o", "out"]) == 1
+    assert "The model in site is not used; --model site would save" in capsys.readouterr().out
+    assert run(["map", "site", "--model", "site", "-o", "out"]) == 1
+    assert "is not used" not in capsys.readouterr().out
     names = ("images/0.png", *scene.images.names[1:])
     write_scene(scene.replace(images=scene.images.replace(names=names)), here / "model.npz")
     assert run(["map", "site", "--model", "model.npz", "-o", "out"]) == 1

@@ -15,6 +15,7 @@ import test_metashape
 import test_nvm
 import test_openmvg
 import test_opensfm
+import test_splats
 import test_transforms
 from _models import rig_scene
 from _mutations import gzip_stored
@@ -91,6 +92,8 @@ def _interchange() -> Iterator[Made]:
             "tracks.csv": test_opensfm.tracks(true, kind, said, 2).encode(),
         }
         yield f"opensfm_{kind}", files, read_scene
+    splats = json.dumps(test_splats.document(true), indent=1).encode()
+    yield "splats", {"cameras.json": splats}, one(read_scene, "cameras.json")
     frames = test_transforms.frames(true)
     lens = {**test_transforms.LENS, **test_transforms.BENT, "camera_model": "OPENCV", "aabb_scale": 16}
     for name, said in (("transforms", lens), ("transforms_angle", {"camera_angle_x": 0.7})):

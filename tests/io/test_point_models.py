@@ -25,6 +25,8 @@ def test_of_several_models_the_one_with_most_images_is_read(tmp_path, form):
     (tmp_path / "sparse" / "2").mkdir()  # no model
     with pytest.warns(UserWarning, match=r"images \(5, in sparse.1\) is read, the others \(3, 2 images\) are not"):
         assert read_colmap(tmp_path).num_images == 5
+    with pytest.warns(UserWarning, match=r"images \(5, in 1\) is read, the others \(3, 2 images\) are not"):
+        assert read_colmap(tmp_path / "sparse").num_images == 5
     assert read_colmap(tmp_path / "sparse" / "0").num_images == 2
 
 

@@ -135,6 +135,17 @@ def test_all_is_matched_only_where_it_may_change_what_is_said(place, localizer, 
     assert len(matched) == times
 
 
+def test_a_calibration_of_the_map_that_does_not_fit_is_estimated(place, localizer, monkeypatch):
+    query = place / "queries" / QUERIES[0]
+    some, said = localizer.localize(query).pose, {}
+    said[False] = replace(some, status="uncertain", settled=True, other_focal=True)
+    monkeypatch.setattr(Localizer, "_pose", lambda *given: (said[given[4].refine_lens], given[6]))
+    for said[True] in (some, replace(some, status="uncertain")):
+        found = localizer.localize(query).pose
+        assert (found is not said[False]) == ("calibration was estimated" in found.sentence) == (said[True] is some)
+        assert localizer.localize(query, some.camera).pose is said[False]  # it was given
+
+
 @pytest.mark.parametrize("estimated", [(True, False), (False, False)])
 def test_the_bits_do_not_depend_on_the_number_of_threads(place, tmp_path, opencv_threads, estimated):
     """Of the index and of poses; poses of the map estimated, or held, whose noise is estimated, too."""

@@ -167,6 +167,8 @@ def test_what_was_matched_without_a_pose_tells_its_lens():
 def test_few_matches_found_without_a_pose_tell_no_lens():
     step, right = LensStep(-0.04, 0.008), Verdict("localized", 1.0, "")
     assert doubted_if_other_lens(right, step, gathered=True).status == "uncertain"
+    assert doubted_if_other_lens(right, step, gathered=True).other_focal
+    assert not doubted_if_other_lens(right, LensStep(0.0, 0.002, 0.2, 100.0)).other_focal
     assert doubted_if_other_lens(right, step, gathered=False) is right
     assert doubted_if_other_lens(right, LensStep(-0.04, 0.002), gathered=False).status == "uncertain"
 

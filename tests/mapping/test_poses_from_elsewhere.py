@@ -133,15 +133,20 @@ def test_matches_of_sides_that_look_alike_contradict_poses_and_are_told(world):
     between = quaternion.multiply(seen[motions.second], quaternion.conjugate(seen[motions.first]))
     found, known = averaged(scene, replace(motions, rotation=between))
     assert "contradict each other" in " ".join(about_contradiction(known.turn.sigma))
-    # Where more matches meet at the given poses these are kept, at the noise of motions; else the others.
-    for more, kept in ((scene, scene), (found, found)):
-        photographs = SimpleNamespace(
-            triangulate=lambda one, error_px, more=more: SimpleNamespace(point_observations=range(8 + (one is more)))
-        )
-        start, start_noise = more_seen(photographs, scene, found, known, motions)
-        assert start is kept and bool(about_contradiction(start_noise.turn.sigma)) == (kept is found)
     noisy = disturbed(scene, 0.2, 5.0, [], 0)
-    assert not about_contradiction(averaged(noisy, motions)[1].turn.sigma) and not about_contradiction(None)
+    other, noise = averaged(noisy, motions)
+    assert not about_contradiction(noise.turn.sigma) and not about_contradiction(None)
+    # Where more matches meet at the given poses these are kept, at the noise of motions; else the others.
+    for given, averages, told in ((scene, found, known), (noisy, other, noise)):
+        for kept in (given, averages):
+            photographs = SimpleNamespace(
+                triangulate=lambda one, _, more=kept: SimpleNamespace(point_observations=range(8 + (one is more)))
+            )
+            start, start_noise = more_seen(photographs, given, averages, told, motions)
+            assert start is kept and (start_noise is told) == (kept is averages)
+    # Poses as good as motions are not asked for; nothing is triangulated.
+    good = averaged(disturbed(scene, 1e-5, 1e-4, [], 0), motions)
+    assert more_seen(SimpleNamespace(), scene, *good, motions) == good
 
 
 @pytest.mark.parametrize("seed", range(4))

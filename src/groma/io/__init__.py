@@ -16,6 +16,7 @@ from groma.io.interchange.metashape import read_metashape
 from groma.io.interchange.nvm import read_nvm
 from groma.io.interchange.openmvg import read_openmvg
 from groma.io.interchange.opensfm import OpenSfmReconstruction, read_opensfm, read_opensfm_reconstructions
+from groma.io.interchange.splats import read_splats
 from groma.io.interchange.transforms import Transforms, read_transforms, write_transforms
 from groma.io.limap.structures import Structures, structures_of
 from groma.io.ply import write_geometry, write_obj, write_ply
@@ -45,6 +46,7 @@ __all__ = [
     "read_opensfm",
     "read_opensfm_reconstructions",
     "read_scene",
+    "read_splats",
     "read_trajectory",
     "read_transforms",
     "read_tum",

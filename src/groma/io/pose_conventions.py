@@ -64,6 +64,7 @@ COLMAP = PoseConvention("COLMAP, text and binary", "cam_from_world", "qw qx qy q
 TRANSFORMS = PoseConvention(
     "transforms.json: nerfstudio, instant-ngp", "world_from_cam", "matrix", "camera centre", "OpenGL"
 )
+SPLATS = PoseConvention("cameras.json: Gaussian splats", "world_from_cam", "matrix", "camera centre")
 LLFF = PoseConvention("poses_bounds.npy: LLFF, NeRF", "world_from_cam", "matrix", "camera centre", "LLFF")
 OPENSFM = PoseConvention("reconstruction.json: OpenSfM, OpenDroneMap", "cam_from_world", "axis and angle", "shift")
 OPENMVG = PoseConvention("sfm_data.json: OpenMVG", "cam_from_world", "matrix", "camera centre")
@@ -84,6 +85,6 @@ G2O = PoseConvention("g2o: VERTEX_SE3:QUAT id x y z qx qy qz qw", "world_from_ca
 
 #: All of them, as the documentation lists them.
 POSE_CONVENTIONS = (
-    COLMAP, TRANSFORMS, LLFF, OPENSFM, OPENMVG, MESHROOM, METASHAPE, NVM, NVM_MATRIX, BUNDLER, BAL, NAMED, TUM, KITTI,
-    LOG, EUROC, G2O,
+    COLMAP, TRANSFORMS, SPLATS, LLFF, OPENSFM, OPENMVG, MESHROOM, METASHAPE, NVM, NVM_MATRIX, BUNDLER, BAL, NAMED, TUM,
+    KITTI, LOG, EUROC, G2O,
 )  # fmt: skip

@@ -3,7 +3,7 @@
 
 ===============================================  ===================================================================
 a model: COLMAP, ``transforms.json``,            images are found by name: the whole path, else its end, else
-OpenSfM, Meshroom, Metashape, an archive, ...    without ending, else in another folder, if just one photograph fits
+OpenSfM, Meshroom, Metashape, splats, ...        without ending, else in another folder, if just one photograph fits
 a trajectory of TUM or EuRoC                     where the names of the photographs are times: the nearest within 20
                                                  ms; else in order, if there are as many of both
 a trajectory of KITTI                            in order, if there are as many; else the numbers in the names are

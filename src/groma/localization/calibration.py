@@ -36,7 +36,7 @@ GATES = CalibrationGates()
 class Calibration:
     """The calibration that a query begins with."""
 
-    #: None: nothing is known.
+    #: None: that of the map for photographs of its size is assumed; or nothing is known.
     camera: QueryCamera | None
     #: Whether focal length and distortion are estimated from there.
     refine: bool
@@ -46,8 +46,8 @@ class Calibration:
 class CalibrationChoice:
     """What the user said of the cameras of queries."""
 
-    #: One of :data:`SOURCES`. ``auto``: the map's for images of its size unless their files say otherwise, then what
-    #: the file says, then unknown.
+    #: One of :data:`SOURCES`. ``auto``: the map's for images of its size unless their files, or what they show, say
+    #: otherwise, then what the file says, then unknown.
     source: str = "auto"
     #: Model and parameters, if they are known.
     model: str | None = None
@@ -100,7 +100,7 @@ def calibration_of(
         own = None if focal is None or photograph is None else _focal_length_once(photograph)
         own = own or float(of_map.kind.focal_length(of_map.params))
         if focal is None or abs(focal - own) <= GATES.focal * own:
-            return Calibration(of_map, False)
+            return Calibration(None, False)
     if focal is None:
         return Calibration(None, True)
     return Calibration(unknown_camera(*size, focal), True)

@@ -185,7 +185,8 @@ class Localizer:
         image : path or (H, W) or (H, W, 3) uint8
             The photograph.
         camera : QueryCamera, optional
-            Its calibration; by default that of the map for images of this size, else it is estimated.
+            Its calibration; by default that of the map for images of this size. Where there is none, or the photograph
+            shows another focal length, because its lens was focused anew, it is estimated.
         refine_lens : bool
             Estimate focal length and distortion, from those of the camera.
         used : (H, W) bool, optional
@@ -194,7 +195,7 @@ class Localizer:
         gray = to_gray(image) if isinstance(image, np.ndarray) else read_gray(Path(image))
         height, width = gray.shape
         options = replace(self.options.pose, refine_lens=refine_lens)
-        camera = camera or self.camera_of_map(width, height)
+        assumed, camera = camera is None and not refine_lens, camera or self.camera_of_map(width, height)
         if camera is None:
             camera = unknown_camera(width, height)
             options = replace(options, refine_lens=True, focal_factors=UNKNOWN_LENS)
@@ -206,21 +207,30 @@ class Localizer:
             )
         if used is not None and used.shape != gray.shape:
             raise ShapeError(f"used must have the shape of the image, {gray.shape}; got {used.shape}.")
-        return self._localize(gray, camera, options, used)
+        return self._localize(gray, camera, options, used, assumed and not options.refine_lens)
 
     def _localize(
-        self, gray: GrayImage, camera: QueryCamera, options: PoseOptions, used: BoolArray | None
+        self, gray: GrayImage, camera: QueryCamera, options: PoseOptions, used: BoolArray | None, assumed: bool
     ) -> LocalizedImage:
         start = time.perf_counter()
         with one_blas_thread():
             query = find_features(gray, camera, self.options.lines, self.options.min_segment_length, used)
             described = time.perf_counter()
             images = self._alike(query.points)
-            pose, last = self._coarsely(query, camera, options, images)
-            if pose.status != "localized" and not pose.settled:
-                pose, last = self._fully(query, camera, options, images)
+            pose, last = self._found(query, camera, options, images)
+            if pose.other_focal and assumed:
+                again = self._found(query, camera, replace(options, refine_lens=True), images)
+                if again[0].status == "localized":
+                    said = f"{again[0].sentence} The calibration was estimated: that of the map does not fit."
+                    pose, last = replace(again[0], sentence=said), again[1]
         done = time.perf_counter()
         return LocalizedImage(pose, last.points[:, 1], last.lines[:, 1], described - start, done - described)
+
+    def _found(self, query: DescribedImage, camera: QueryCamera, options: PoseOptions, images: IntArray) -> _Found:
+        pose, last = self._coarsely(query, camera, options, images)
+        if pose.status == "localized" or pose.settled:
+            return pose, last
+        return self._fully(query, camera, options, images)
 
     def _coarsely(self, query: DescribedImage, camera: QueryCamera, options: PoseOptions, images: IntArray) -> _Found:
         """Look for the coarsest points among all that the images see: enough where the place is plain."""

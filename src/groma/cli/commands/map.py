@@ -179,7 +179,7 @@ def map_(
     measured.validate()
     measured = measured if _has_noise(poses, measured.pose_sigma) else replace(measured, poses=None)
     check_inputs(images, model, poses, rig, line_matches, truth, extend, map_images, depth, masks, *measured.files)
-    images = _photographs_of(console, images, model)
+    images = _photographs_of(console, images, model, hint=poses is None and extend is None)
     maps = _depth.depth_maps(depth, depth_scale, relative_depth, images)
     known = {"--model": model, "--poses": poses, "--rig": rig, "--camera-params": camera_params, "--depth": depth}
     check_extension(extend, map_images, known)
@@ -253,10 +253,11 @@ def map_(
     _output.write_json(console.json_target, numbers, force)
 
 
-def _photographs_of(console: Console, folder: Path, model: Path | None) -> Path:
+def _photographs_of(console: Console, folder: Path, model: Path | None, hint: bool) -> Path:
     """Return the folder ``images`` of a project, whose masks and depths are no photographs; else the folder itself."""
     from groma.bounded.names import IMAGES
     from groma.io import read_scene
+    from groma.io.colmap.files import is_model
     from groma.io.colmap.rigs import RIG_FILE
 
     inner = folder / "images"
@@ -265,6 +266,8 @@ def _photographs_of(console: Console, folder: Path, model: Path | None) -> Path:
     if model is not None and any((folder / name).is_file() for name in read_scene(model).images.names):
         return folder
     console.say(f"Photographs: {inner}; nothing else in {folder} is taken for one.")
+    if model is None and hint and is_model(folder):
+        console.say(f"The model in {folder} is not used; --model {folder} would save the reconstruction of points.")
     return inner
 
 

@@ -48,6 +48,6 @@ Input = Annotated[
     typer.Argument(
         metavar="INPUT",
         help="COLMAP model folder, groma archive (.npz), BAL, Bundler, VisualSFM, OpenMVG, Meshroom, Metashape, "
-        "OpenSfM or nerfstudio file.",
+        "OpenSfM or nerfstudio file, cameras.json of Gaussian splats.",
     ),
 ]

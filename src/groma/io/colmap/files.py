@@ -30,10 +30,10 @@ POINT = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
 
 
 def find_model(path: str | os.PathLike[str]) -> tuple[Path, Literal["binary", "text"]]:
-    """Return the folder of the model at ``path``, ``path/sparse`` or ``path/sparse/0``, and its form.
+    """Return the folder of the model at ``path``, ``path/sparse``, ``path/sparse/0`` or ``path/0``, and its form.
 
-    Of several models in ``path/sparse``, as COLMAP makes them where photographs do not hang together, it is the one
-    with most images.
+    Of several numbered models, as COLMAP makes them where photographs do not hang together, it is the one with most
+    images.
 
     Raises
     ------
@@ -46,24 +46,25 @@ def find_model(path: str | os.PathLike[str]) -> tuple[Path, Literal["binary", "t
         if form is not None:
             return place, form
     raise FileFormatError(
-        f"{root} holds no COLMAP model: expected cameras, images and points3D, all .bin or all .txt, there, in sparse "
-        f"or in sparse/0. {_remedy(root)}"
+        f"{root} holds no COLMAP model: expected cameras, images and points3D, all .bin or all .txt, there, in sparse, "
+        f"in sparse/0 or in 0. {_remedy(root)}"
     )
 
 
 def models_in_parts(root: Path) -> dict[Path, int]:
-    """Return the models ``sparse/0``, ``sparse/1``, ... of a folder with their numbers of images, the largest first."""
+    """Return the models ``sparse/0``, ... or ``0``, ... of a folder with their numbers of images, the largest first."""
     found = {place: _num_images(place) for place in _parts(root) if _form(place) is not None}
     return dict(sorted(found.items(), key=lambda one: -one[1]))
 
 
 def missing_from_parts(root: Path) -> str:
-    """Say which files models ``sparse/0``, ``sparse/1``, ... of a folder lack; empty where they are whole."""
+    """Say which files models ``sparse/0``, ... or ``0``, ... of a folder lack; empty where they are whole."""
     return _are_missing([f"{place.relative_to(root)}/{name}" for place in _parts(root) for name in _missing(place)])
 
 
 def _parts(root: Path) -> list[Path]:
-    return sorted((p for p in (root / "sparse").glob("[0-9]*") if p.name.isdecimal()), key=lambda p: int(p.name))
+    numbered = [p for p in (*root.glob("sparse/[0-9]*"), *root.glob("[0-9]*")) if p.name.isdecimal()]
+    return sorted(numbered, key=lambda p: (p.parent == root, int(p.name)))
 
 
 def _missing(place: Path) -> list[str]:
@@ -82,7 +83,7 @@ def _are_missing(files: list[str]) -> str:
 def is_model(place: Path) -> bool:
     """Whether a folder holds a model, or a file is named like one of a model's."""
     if place.is_dir():
-        return any(_form(part) is not None for part in (place, place / "sparse", *(place / "sparse").glob("[0-9]*")))
+        return any(_form(part) is not None for part in (place, place / "sparse", *_parts(place)))
     return place.suffix in (".bin", ".txt") and place.stem in (*_FILES, "rigs", "frames")
 
 

@@ -64,7 +64,7 @@ def read_colmap(path: str | os.PathLike[str]) -> Scene:
     Parameters
     ----------
     path : path
-        Folder of the model, or a folder with the model in ``sparse`` or ``sparse/0``.
+        Folder of the model, or a folder with the model in ``sparse``, ``sparse/0`` or ``0``.
 
     Raises
     ------

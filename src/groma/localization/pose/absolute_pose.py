@@ -127,12 +127,11 @@ class AbsolutePose:
     sigma0: float = 1.0
     #: Another pose that fits about as well, where there is one.
     rival: FloatArray | None = None
-    #: Whether what agrees would do, but what else the photograph shows, or does not, speaks against the pose; more
-    #: matches would hardly change that.
+    #: Whether what agrees would do, but what else the photograph shows, or does not, speaks against the pose.
     contradicted: bool = False
-    #: Whether it is something that all features near the pose say, however it was found: more matches to find one by
-    #: change nothing.
+    #: Whether all features near the pose say so, however it was found: more matches to find one by change nothing.
     settled: bool = False
+    other_focal: bool = False  #: Whether that is another focal length than was given.
 
     @property
     def center(self) -> FloatArray | None:
@@ -304,6 +303,7 @@ def _judged(
         rival if verdict.status == "uncertain" else None,
         verdict.contradicted,
         verdict.settled,
+        verdict.other_focal,
     )
 
 

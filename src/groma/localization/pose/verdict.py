@@ -44,7 +44,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -89,6 +89,8 @@ class Verdict:
     contradicted: bool = False
     #: Whether it is something that all features near the pose say, however it was found.
     settled: bool = False
+    #: Whether that is another focal length than was given.
+    other_focal: bool = False
 
     def doubted(self, why: str, probability: float = 0.5) -> Verdict:
         """The same of a pose that something else speaks against: by itself right with this probability, or even."""
@@ -271,10 +273,11 @@ def doubted_if_other_lens(verdict: Verdict, step: LensStep, gathered: bool = Tru
         )
     noise = math.sqrt(chi_square_gate(1.0 - VERDICT.right, 1)) * step.focal_sigma
     if abs(step.focal) > max(VERDICT.focal, noise) and (gathered or noise <= VERDICT.focal):
-        return verdict.doubted(
+        doubted = verdict.doubted(
             f"they fit a {'longer' if step.focal > 0.0 else 'shorter'} focal length better: the calibration is not "
             "that of this photograph. Pass its own, or let it be estimated (--calibration unknown)."
         )
+        return replace(doubted, other_focal=True)
     return verdict
 
 

@@ -181,18 +181,19 @@ def averaged(scene: Scene, motions: Motions) -> tuple[Scene, GivenPoses]:
 def more_seen(
     photographs: PosedPhotographs, given: Scene, found: Scene, known: GivenPoses, motions: Motions
 ) -> tuple[Scene, GivenPoses]:
-    """Return averaged poses, or the given ones if both contradict each other and more matches meet at these.
+    """Return averaged poses, or the given ones if both differ by more than motions say and more matches meet at these.
 
-    Where an object looks alike from several sides most motions can be wrong, and agree with each other.
+    Where an object looks alike from several sides most motions can be wrong, and agree with each other; of a long lens
+    they can be off by far more than they say.
     """
-    if not about_contradiction(known.turn.sigma):
+    turn, way = float(np.median(motions.rotation_sigma)), float(np.median(motions.direction_sigma))
+    if known.turn.sigma is None or known.turn.sigma <= turn:
         return found, known
     seen = [len(photographs.triangulate(one, GATES.tolerances_px[-1]).point_observations) for one in (given, found)]
     if seen[0] <= seen[1]:
         return found, known
     centers = given.cam_centers_in_world
     apart = float(np.median(np.linalg.norm(centers[motions.first] - centers[motions.second], axis=1)))
-    turn, way = float(np.median(motions.rotation_sigma)), float(np.median(motions.direction_sigma))
     clean = GivenNoise(None, np.zeros(given.num_images, bool))
     return given, GivenPoses(known.poses, clean, clean, (apart * way, turn))
 
