@@ -59,7 +59,7 @@ from groma.scene import Scene
 
 #: The quantities of the first factor, and the weight of each as ``benchmarks/line_confidence.py`` found it.
 WEIGHTS: dict[str, float] = {
-    "constant": 2.973, "spread": 1.118, "support": 1.476, "beside": 1.151, "residual": -0.927, "drift": -1.494,
+    "constant": 2.882, "spread": 1.200, "support": 1.551, "beside": 1.025, "residual": -1.017, "drift": -1.503,
 }  # fmt: skip
 
 
