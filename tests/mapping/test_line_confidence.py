@@ -61,18 +61,18 @@ def within(limit):
 
 
 def columns(scene):
-    return dict(zip([*WEIGHTS, "contrast"], line_evidence(scene).T, strict=True))
+    return dict(zip([*WEIGHTS, "contrast", "length"], line_evidence(scene).T, strict=True))
 
 
-def rows_of(together, contrast):
-    """Evidence of lines with some log likelihood ratios that their segments belong together, and log contrasts."""
-    rows = np.zeros((len(contrast), len(WEIGHTS) + 1))
-    rows[:, 0], rows[:, -1] = np.asarray(together) / WEIGHTS["constant"], contrast
+def rows_of(together, contrast, length=0.0):
+    """Evidence of lines: log likelihood ratios that their segments belong together, log contrasts and lengths."""
+    rows = np.zeros((len(contrast), len(WEIGHTS) + 2))
+    rows[:, 0], rows[:, -2], rows[:, -1] = np.asarray(together) / WEIGHTS["constant"], contrast, length
     return rows
 
 
-def texture_told(contrast, together=50.0):
-    return edge_probability(rows_of(together, contrast), np.array(list(WEIGHTS.values())))
+def texture_told(contrast, together=50.0, length=0.0):
+    return edge_probability(rows_of(together, contrast, length), np.array(list(WEIGHTS.values())))
 
 
 @pytest.fixture
@@ -91,6 +91,7 @@ def test_evidence_by_hand():
     np.testing.assert_allclose(np.exp(found["spread"]), np.sin(np.arctan(0.1)), rtol=1e-9)
     # Nothing is known of their contrast: it is the usual one.
     np.testing.assert_allclose(np.exp(found["contrast"]), GATES.usual_contrast, rtol=1e-9)
+    np.testing.assert_allclose(np.exp(found["length"]), np.array([100.0, 1050.0]) / 575.0, rtol=1e-9)
     # Both are seen by all images; the second leaves the frame, so that no image is expected to show it.
     np.testing.assert_allclose(np.exp(found["support"]), [5.0, 5.0])
     fewer = scene_of(ends, [[-1.0, 0, 0], [1, 0, 0], [0, 0, 1]], noise=0.0)
@@ -199,25 +200,34 @@ def test_the_lines_of_a_scene_tell_the_share_that_is_texture():
 
 def test_the_lines_of_a_scene_tell_how_far_its_edges_stand_out():
     rng, (stripe, sigma) = np.random.default_rng(0), GATES.stripe_contrast
-    draws = rng.normal(size=300)
+    draws, length = rng.normal(size=300), 0.75 * rng.normal(size=300)
     # Edges between rough stones stand out little. Lines like them are stripes where edges stand out on plain walls.
     stripes = stripe + sigma * draws
-    assert np.median(texture_told(1.6 + 0.7 * draws)) > 0.8
+    assert np.median(texture_told(1.6 + 0.7 * draws, length=length)) > 0.7
     assert texture_told([1.6, *(3.8 + 0.7 * draws), *stripes])[0] < 0.5
-    assert (texture_told(stripes) > 0.5).mean() < 0.1  # where all is texture
+    assert (texture_told(stripes, length=length) > 0.5).mean() < 0.1  # where all is texture
+
+
+def test_long_lines_among_stripes_are_edges_though_others_lie_close_beside_them():
+    (stripe, _), others = GATES.stripe_contrast, np.repeat([GATES.edge_contrast[0], GATES.stripe_contrast[0]], 100)
+    length = np.zeros(201)
+    doubtful = [stripe + 0.7, *others]
+    usual, short, long = (texture_told(doubtful, length=np.r_[x, length[1:]])[0] for x in (0.0, -0.5, 1.8))
+    assert long > 0.6 > 0.3 > usual > short
 
 
 def test_a_little_less_contrast_does_not_turn_all_edges_to_texture():
-    draws = np.random.default_rng(1).normal(size=500)
-    expected = [texture_told(mean + 0.7 * draws).mean() for mean in np.arange(2.0, 0.7, -0.05)]
-    assert expected[0] > 0.8 and expected[-1] < 0.2 and np.abs(np.diff(expected)).max() < 0.25
-    assert texture_told(1.67 + 0.71 * draws).mean() == pytest.approx(texture_told(1.51 + 0.69 * draws).mean(), abs=0.15)
+    draws, length = np.random.default_rng(1).normal(size=(2, 500)) * [[0.7], [0.75]]
+    expected = [texture_told(mean + draws, length=length).mean() for mean in np.arange(2.0, 0.7, -0.05)]
+    assert expected[0] > 0.8 and expected[-1] < 0.3 and np.abs(np.diff(expected)).max() < 0.1
 
 
 def test_less_contrast_never_makes_an_edge_likelier():
     for usual in (1.2, 2.5, 4.0):
         found = texture_told([*np.linspace(-6.0, 8.0, 141), *[usual] * 400])
         assert (np.diff(found[:141]) >= 0.0).all()
+    found = texture_told(np.full(201, 1.6), length=np.linspace(-3.0, 4.0, 201))
+    assert (np.diff(found) >= 0.0).all()
 
 
 def test_residuals_are_told_in_pixels_whatever_the_standard_deviations_say(scene):

@@ -13,17 +13,18 @@ outline of a round body is no edge, and moves with the view: its segments drift 
 images that show the body beside it do not show it where others do. How many lines of a scene have an edge is not known
 beforehand: nearly all of a plain box, few of an upholstered chair. Their share, of log odds b, is estimated from the
 lines themselves, with a prior of m lines of which half have one (:func:`edge_probability`). The second, that they are
-no texture, is told by contrast alone (:mod:`groma.features.contrast`), since texture has stripes of the same gradient
-beside it. Where views agree on texture, as they do on stripes of a wall, only this factor tells: stripes are found at
-the same place by any photographs. The logarithm of the contrast :math:`x_t` of stripes is normal with a mean and a
-deviation that texture has anywhere, as it is divided by its own surroundings; z is the logarithm of the likelihood
-ratio of edges to stripes. How far edges stand out is a matter of the scene: much on plain walls, little between rough
-stones. So the mean :math:`\mu` of edges is one of the scene, with a wide prior, and E the mean over what its lines say
-of it. The share of lines that are none, of log odds c, is estimated like the other. The third is the probability of an
-error within :math:`\tau = 0.0025`, where u is the standard deviation across the line that half of its places do not
-exceed, over the usual distance, and F the Student distribution of four degrees of freedom: errors have heavy tails,
-since what edges beside it displace is displaced in all images alike. Segments and the planes that the line lies on tell
-u together: of an edge that all images see from one height, planes know the depth. The fourth is the share of normal
+no texture, is told by contrast (:mod:`groma.features.contrast`), since texture has stripes of the same gradient beside
+it. Where views agree on texture, as they do on stripes of a wall, only this factor tells: stripes are found at the same
+place by any photographs. The logarithm of the contrast :math:`x_t` of stripes is normal with a mean and a deviation
+that texture has anywhere, as it is divided by its own surroundings; z is the logarithm of the likelihood ratio of edges
+to stripes. How far edges stand out is a matter of the scene: much on plain walls, little between rough stones. So the
+mean :math:`\mu` of edges is one of the scene, with a wide prior, and E the mean over what its lines say of it. Long
+lines among others, such as flights of steps, are edges though little contrast is left between them: stripes are short.
+The share of lines that are none, of log odds c, is estimated like the other. The third is the probability of an error
+within :math:`\tau = 0.0025`, where u is the standard deviation across the line that half of its places do not exceed,
+over the usual distance, and F the Student distribution of four degrees of freedom: errors have heavy tails, since what
+edges beside it displace is displaced in all images alike. Segments and the planes that the line lies on tell u
+together: of an edge that all images see from one height, planes know the depth. The fourth is the share of normal
 residuals of r pixels root mean square within the width of an edge, a pixel: chords of curves fit no single line, and
 where segments of a curve are bowed their standard deviations, and with them r, say so.
 
@@ -59,7 +60,7 @@ from groma.scene import Scene
 
 #: The quantities of the first factor, and the weight of each as ``benchmarks/line_confidence.py`` found it.
 WEIGHTS: dict[str, float] = {
-    "constant": 2.882, "spread": 1.200, "support": 1.551, "beside": 1.025, "residual": -1.017, "drift": -1.503,
+    "constant": 2.960, "spread": 1.172, "support": 1.508, "beside": 1.075, "residual": -0.962, "drift": -1.524,
 }  # fmt: skip
 
 
@@ -85,6 +86,10 @@ class ConfidenceGates:
         "derived from rendered scenes and walls",
     )
     edge_deviation: float = gate(0.9, "1", "of the log contrast of edges of a scene", "derived from stairs and a room")
+    stripe_length: tuple[float, float] = gate(
+        (-0.16, 0.62), "1", "the same of the log length over the median of all lines", "derived from stairs"
+    )
+    edge_length: tuple[float, float] = gate((0.33, 0.86), "1", "that of edges", "derived from stairs")
     edge_px: float = gate(SEGMENTS.edge, "px", "residual of a segment of a right line", "derived from an edge's width")
     usual_contrast: float = gate(30.0, "1", "of segments whose contrast is unknown", "chosen on the scenes of the fit")
 
@@ -124,11 +129,12 @@ def edge_probability(evidence: FloatArray, weights: FloatArray) -> FloatArray:
     together, and of those among them that are no texture, are estimated from the lines, as is the contrast of edges.
     """
     expit, gates = scipy.special.expit, GATES
-    together, contrast = evidence[:, :-1] @ weights, evidence[:, -1]
+    together, contrast, length = evidence[:, :-2] @ weights, *evidence[:, -2:].T
     belongs = expit(together + _share_odds(together, np.ones(len(together))))
     usual, spread = gates.edge_contrast
     means = np.linspace(gates.stripe_contrast[0], usual + 3.0 * spread, _MEANS)[:, None]
-    ratio = _contrast_ratio(contrast, means)
+    ratio = _edge_ratio(contrast, gates.stripe_contrast, means, gates.edge_deviation)
+    ratio = ratio + _edge_ratio(length, gates.stripe_length, *gates.edge_length)
     odds = _share_odds(ratio, belongs)
     # Log likelihood of the lines over that if all were stripes, and the prior of the mean.
     fit = (belongs * (np.logaddexp(0.0, ratio + odds) - np.logaddexp(0.0, odds))).sum(axis=1, keepdims=True)
@@ -137,15 +143,18 @@ def edge_probability(evidence: FloatArray, weights: FloatArray) -> FloatArray:
     return belongs * (weight / weight.sum() * expit(ratio + odds)).sum(axis=0)
 
 
-def _contrast_ratio(contrast: FloatArray, means: FloatArray) -> FloatArray:
-    """(M, L) log likelihood ratios of edges to stripes, given log contrasts (L,) and the means (M, 1) of edges.
+def _edge_ratio(
+    told: FloatArray, stripe: tuple[float, float], edge: float | FloatArray, edge_sigma: float
+) -> FloatArray:
+    """(..., L) log likelihood ratios of edges to stripes, both normal, given what is told of lines (L,).
 
-    Edges vary more than stripes. Below the contrast of the smallest ratio less contrast says nothing more.
+    ``stripe`` has mean and deviation; ``edge`` is one mean or several (M, 1). Edges vary more: below what has the
+    smallest ratio, less says nothing more.
     """
-    (mean, sigma), edge = GATES.stripe_contrast, GATES.edge_deviation
-    least = (mean / sigma**2 - means / edge**2) / (sigma**-2.0 - edge**-2.0)
-    x = np.maximum(contrast, least)
-    return 0.5 * ((x - mean) / sigma) ** 2 - 0.5 * ((x - means) / edge) ** 2 + math.log(sigma / edge)
+    mean, sigma = stripe
+    least = (mean / sigma**2 - edge / edge_sigma**2) / (sigma**-2.0 - edge_sigma**-2.0)
+    x = np.maximum(told, least)
+    return 0.5 * ((x - mean) / sigma) ** 2 - 0.5 * ((x - edge) / edge_sigma) ** 2 + math.log(sigma / edge_sigma)
 
 
 def _share_odds(ratio: FloatArray, count: FloatArray) -> FloatArray:
@@ -180,9 +189,9 @@ def line_accuracy(
 
 
 def line_evidence(scene: Scene, noise: LineNoise | None = None) -> FloatArray:
-    r"""Return what the probability that there is an edge is computed from, (L, 7).
+    r"""Return what the probability that there is an edge is computed from, (L, 8).
 
-    The columns are the quantities of ``WEIGHTS``, in their order, and the contrast.
+    The columns are the quantities of ``WEIGHTS``, in their order, then contrast and length.
 
     ``noise`` is that of the lines, if it is known.
 
@@ -196,11 +205,14 @@ def line_evidence(scene: Scene, noise: LineNoise | None = None) -> FloatArray:
     ``drift``       logarithm of 1 + t, where t is how many standard deviations the radius is off zero of the cylinder
                     whose outlines explain its segments best
     ``contrast``    mean over its segments of the logarithm of their contrast
+    ``length``      logarithm of the length of its longest segment over the median of those of all lines
     ==============  ===============================================================================================
     """
     seen, noise = scene.line_observations, line_noise(scene) if noise is None else noise
     images = num_distinct(seen.line_idx, seen.image_idx, scene.num_lines)
     absent, absent_beside = _num_absent(scene)
+    longest = np.ones(scene.num_lines)
+    np.maximum.at(longest, seen.line_idx, segment2.length(seen.segment))
     return np.column_stack(
         [
             np.ones(scene.num_lines),
@@ -210,6 +222,7 @@ def line_evidence(scene: Scene, noise: LineNoise | None = None) -> FloatArray:
             np.log(_residual_px(scene, noise)),
             np.log1p(np.abs(_drift(scene, noise))),
             _log_contrast(scene),
+            np.log(longest / (np.median(longest) if len(longest) else 1.0)),
         ]
     )
 
