@@ -29,8 +29,6 @@ from groma.mapping.checkpoints import Stages
 from groma.mapping.lines.confidence import (
     DEFAULT_CONFIDENCE,
     GATES,
-    NO_TEXTURE,
-    TOGETHER,
     WEIGHTS,
     edge_probability,
     line_accuracy,
@@ -118,13 +116,13 @@ def fitted(scenes: list[Judged]) -> np.ndarray:
 
     Scenes of boxes and scenes of round bodies count alike: the latter have a fifth of the lines, and all the outlines.
     """
-    x = np.concatenate([one.evidence for one in scenes])
+    x = np.concatenate([one.evidence[:, :-2] for one in scenes])
     is_round = np.array(["round" in one.source.name for one in scenes])
     lines = np.array([len(one.right) for one in scenes])
     count = np.where(is_round, lines[~is_round].sum() / lines[is_round].sum(), 1.0)
     varies = np.ptp(x, axis=0) > 0.0
     mean, spread = np.where(varies, x.mean(0), 0.0), np.where(varies, x.std(0), 1.0)
-    rows = [(one.evidence - mean) / spread for one in scenes]
+    rows = [np.column_stack([(one.evidence[:, :-2] - mean) / spread, one.evidence[:, -2:]]) for one in scenes]
 
     def cost(weights: np.ndarray) -> float:
         total = 0.5 * (weights[varies] ** 2).sum()
@@ -134,8 +132,7 @@ def fitted(scenes: list[Judged]) -> np.ndarray:
         return total
 
     weights = minimize(cost, np.ones(x.shape[1]), method="L-BFGS-B").x / spread
-    for part in (TOGETHER, NO_TEXTURE):  # the first quantity of each is one
-        weights[part.start] -= weights[part] @ mean[part]
+    weights[0] -= weights @ mean  # the first quantity is one
     return weights
 
 

@@ -11,8 +11,6 @@ from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.io.archive import read_archive, write_archive
 from groma.mapping.lines.confidence import (
     GATES,
-    NO_TEXTURE,
-    TOGETHER,
     WEIGHTS,
     edge_probability,
     line_accuracy,
@@ -63,7 +61,18 @@ def within(limit):
 
 
 def columns(scene):
-    return dict(zip(WEIGHTS, line_evidence(scene).T, strict=True))
+    return dict(zip([*WEIGHTS, "contrast", "length"], line_evidence(scene).T, strict=True))
+
+
+def rows_of(together, contrast, length=0.0):
+    """Evidence of lines: log likelihood ratios that their segments belong together, log contrasts and lengths."""
+    rows = np.zeros((len(contrast), len(WEIGHTS) + 2))
+    rows[:, 0], rows[:, -2], rows[:, -1] = np.asarray(together) / WEIGHTS["constant"], contrast, length
+    return rows
+
+
+def texture_told(contrast, together=50.0, length=0.0):
+    return edge_probability(rows_of(together, contrast, length), np.array(list(WEIGHTS.values())))
 
 
 @pytest.fixture
@@ -81,8 +90,8 @@ def test_evidence_by_hand():
     found = columns(scene_of(ends, [[-1.0, 0, 0], [1, 0, 0]], noise=0.0))
     np.testing.assert_allclose(np.exp(found["spread"]), np.sin(np.arctan(0.1)), rtol=1e-9)
     # Nothing is known of their contrast: it is the usual one.
-    usual = GATES.usual_contrast * np.array([100.0, 1050.0]) / 575.0
-    np.testing.assert_allclose(np.exp(found["prominence"]), usual, rtol=1e-9)
+    np.testing.assert_allclose(np.exp(found["contrast"]), GATES.usual_contrast, rtol=1e-9)
+    np.testing.assert_allclose(np.exp(found["length"]), np.array([100.0, 1050.0]) / 575.0, rtol=1e-9)
     # Both are seen by all images; the second leaves the frame, so that no image is expected to show it.
     np.testing.assert_allclose(np.exp(found["support"]), [5.0, 5.0])
     fewer = scene_of(ends, [[-1.0, 0, 0], [1, 0, 0], [0, 0, 1]], noise=0.0)
@@ -162,23 +171,11 @@ def test_lines_that_do_not_stand_out_are_texture(scene):
     np.testing.assert_allclose(line_evidence(part), line_evidence(whole), rtol=1e-12)
 
 
-def test_an_edge_and_texture_are_equally_likely_at_the_prominence_of_the_weights():
-    weights = np.array(list(WEIGHTS.values()))
-    rows = np.zeros((3, len(WEIGHTS)))
-    rows[:, [TOGETHER.start, NO_TEXTURE.start]] = 1.0
-    limit = -WEIGHTS["texture"] / WEIGHTS["prominence"]
-    rows[:, -1] = limit + np.array([0.0, 20.0, -20.0])
-    at, far, below = edge_probability(rows, weights)
-    assert at == pytest.approx(0.5 * far) and below < 1e-12
-
-
 def test_the_lines_of_a_scene_tell_the_share_that_has_an_edge():
     weights = np.array(list(WEIGHTS.values()))
 
     def probability(*likelihood):  # logarithms of ratios; no line is texture
-        rows = np.zeros((len(likelihood), len(WEIGHTS)))
-        rows[:, TOGETHER.start], rows[:, -1] = np.array(likelihood) / weights[TOGETHER.start], 50.0
-        return edge_probability(rows, weights)
+        return edge_probability(rows_of(likelihood, np.full(len(likelihood), 50.0)), weights)
 
     for doubtful in ([0.5], [0.5] * 300, [0.5, *[9.0] * 100], [0.5, *[-9.0] * 100]):
         found = probability(*doubtful)
@@ -192,40 +189,45 @@ def test_the_lines_of_a_scene_tell_the_share_that_has_an_edge():
 
 
 def test_the_lines_of_a_scene_tell_the_share_that_is_texture():
-    weights = np.array(list(WEIGHTS.values()))
-
-    def probability(*likelihood, together=(50.0,)):
-        rows = np.zeros((len(likelihood), len(WEIGHTS)))
-        rows[:, TOGETHER.start] = np.array(together) / weights[TOGETHER.start]
-        rows[:, -1] = np.array(likelihood) / weights[NO_TEXTURE][-1]
-        return edge_probability(rows, weights)
-
-    alone, plain, striped = (probability(0.5, *others)[0] for others in ((), [9.0] * 100, [-9.0] * 100))
-    assert striped < alone - 0.3 and alone == pytest.approx(expit(0.5), abs=0.01) and plain > alone + 0.2
-    found = probability(0.5, *[-9.0] * 100)
-    share = (0.5 * GATES.prior_lines + found.sum()) / (GATES.prior_lines + len(found))
-    np.testing.assert_allclose(found[0], expit(0.5 + logit(share)), rtol=1e-9)
+    (stripe, _), (edge, _), doubtful = GATES.stripe_contrast, GATES.edge_contrast, 2.0
+    alone = texture_told([doubtful])[0]
+    plain, striped = (texture_told([doubtful, *np.repeat([edge, stripe], n)])[0] for n in ([100, 5], [5, 100]))
+    assert striped < alone - 0.1 and plain > alone + 0.1
     # Lines whose segments do not belong together tell nothing of texture.
-    unrelated = probability(0.5, *[-9.0] * 100, together=(50.0, *[-50.0] * 100))
-    assert unrelated[0] == pytest.approx(alone, abs=1e-9)
+    unrelated = texture_told([doubtful, *[stripe] * 100], [50.0, *[-50.0] * 100])[0]
+    assert unrelated == pytest.approx(alone, abs=1e-9)
 
 
-def test_where_most_lines_are_stripes_all_prominences_are_too_high():
-    weights, gates = np.array(list(WEIGHTS.values())), GATES
+def test_the_lines_of_a_scene_tell_how_far_its_edges_stand_out():
+    rng, (stripe, sigma) = np.random.default_rng(0), GATES.stripe_contrast
+    draws, length = rng.normal(size=300), 0.75 * rng.normal(size=300)
+    # Edges between rough stones stand out little. Lines like them are stripes where edges stand out on plain walls.
+    stripes = stripe + sigma * draws
+    assert np.median(texture_told(1.6 + 0.7 * draws, length=length)) > 0.7
+    assert texture_told([1.6, *(3.8 + 0.7 * draws), *stripes])[0] < 0.5
+    assert (texture_told(stripes, length=length) > 0.5).mean() < 0.1  # where all is texture
 
-    def probability(prominence):
-        rows = np.ones((len(prominence), len(WEIGHTS)))
-        rows[:, TOGETHER], rows[:, -1] = 50.0 / weights[TOGETHER], prominence
-        return edge_probability(rows, weights)
 
-    # Two of three lines are stripes, so that the median length, by which lengths are divided, is theirs.
-    doubtful, likely = gates.stripe_prominence + 1.7, gates.stripe_prominence + 2.7
-    usual = np.repeat([gates.stripe_prominence, gates.edge_prominence], [200, 100])
-    right, shifted = probability([*usual, doubtful]), probability([*(usual + 0.7), doubtful])
-    assert shifted[-1] < 0.6 * right[-1]
-    # Edges that are weak do not make stripes of others.
-    weak = probability([*(usual - 0.7), likely])
-    assert weak[-1] == pytest.approx(probability([*usual, likely])[-1], abs=0.02)
+def test_long_lines_among_stripes_are_edges_though_others_lie_close_beside_them():
+    (stripe, _), others = GATES.stripe_contrast, np.repeat([GATES.edge_contrast[0], GATES.stripe_contrast[0]], 100)
+    length = np.zeros(201)
+    doubtful = [stripe + 0.7, *others]
+    usual, short, long = (texture_told(doubtful, length=np.r_[x, length[1:]])[0] for x in (0.0, -0.5, 1.8))
+    assert long > 0.6 > 0.3 > usual > short
+
+
+def test_a_little_less_contrast_does_not_turn_all_edges_to_texture():
+    draws, length = np.random.default_rng(1).normal(size=(2, 500)) * [[0.7], [0.75]]
+    expected = [texture_told(mean + draws, length=length).mean() for mean in np.arange(2.0, 0.7, -0.05)]
+    assert expected[0] > 0.8 and expected[-1] < 0.3 and np.abs(np.diff(expected)).max() < 0.1
+
+
+def test_less_contrast_never_makes_an_edge_likelier():
+    for usual in (1.2, 2.5, 4.0):
+        found = texture_told([*np.linspace(-6.0, 8.0, 141), *[usual] * 400])
+        assert (np.diff(found[:141]) >= 0.0).all()
+    found = texture_told(np.full(201, 1.6), length=np.linspace(-3.0, 4.0, 201))
+    assert (np.diff(found) >= 0.0).all()
 
 
 def test_residuals_are_told_in_pixels_whatever_the_standard_deviations_say(scene):
@@ -325,8 +327,8 @@ def test_good_lines_are_more_probable_than_lines_of_unrelated_segments(scene):
     assert ranks[wrong].mean() < 7.0 and np.median(after[10:]) > 5.0 * np.median(after[wrong])
     fewer = line_confidence(scene.keep(line_observations=seen.image_idx < 3))
     assert (fewer < before).mean() > 0.9
-    signs = {name: np.sign(WEIGHTS[name]) for name in ("spread", "support", "prominence", "residual")}
-    assert signs == {"spread": 1, "support": 1, "prominence": 1, "residual": -1}
+    signs = {name: np.sign(WEIGHTS[name]) for name in ("spread", "support", "beside", "residual")}
+    assert signs == {"spread": 1, "support": 1, "beside": 1, "residual": -1}
 
 
 def test_kept_in_archives(scene, tmp_path):

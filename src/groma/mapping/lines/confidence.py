@@ -4,7 +4,8 @@ r"""How probable it is that a line is right, from what its observations say.
 A line is called right where an edge of the object runs along it, at least along half of it, within 2.5 thousandths of
 the usual distance of lines from their cameras. Four things must be true of it:
 
-.. math:: p = \frac{1}{1 + \exp(-w_0 - \sum_k w_k x_k - b)}\; \frac{1}{1 + \exp(-w_s - w_t (x_t - \delta) - c)}\;
+.. math:: p = \frac{1}{1 + \exp(-w_0 - \sum_k w_k x_k - b)}\;
+          E\Bigl[\frac{1}{1 + \exp(-z(x_t, \mu) - c)}\Bigr]\;
           \bigl(2 F_4(\tau / u) - 1\bigr)\; \operatorname{erf}\frac{1}{\sqrt 2\, r}.
 
 The first factor, that its segments belong together, is a logistic model of five quantities (:func:`line_evidence`). The
@@ -12,19 +13,20 @@ outline of a round body is no edge, and moves with the view: its segments drift 
 images that show the body beside it do not show it where others do. How many lines of a scene have an edge is not known
 beforehand: nearly all of a plain box, few of an upholstered chair. Their share, of log odds b, is estimated from the
 lines themselves, with a prior of m lines of which half have one (:func:`edge_probability`). The second, that they are
-no texture, is one of the prominence alone: contrast (:mod:`groma.features.contrast`) times relative length, since
-texture has stripes of the same contrast beside it, and its stripes are short. Where views agree on texture, as they do
-on stripes of a wall, only this factor tells. Whether there is such texture, the lines tell as well: where many are
-surely stripes, doubtful ones are likely more of them. The share of lines that are none, of log odds c, is estimated
-like the other. Stripes are shorter than edges: where most lines are stripes, the median length is theirs, and the
-prominence of all lines is too high. By how much, :math:`\delta`, the lines tell together with the share: edges and
-stripes of a scene are, in the mean, as prominent as those of the fit, :math:`\mu_e` and :math:`\mu_t`. The third is the
-probability of an error within :math:`\tau = 0.0025`, where u is the standard deviation across the line that half of its
-places do not exceed, over the usual distance, and F the Student distribution of four degrees of freedom: errors have
-heavy tails, since what edges beside it displace is displaced in all images alike. Segments and the planes that the line
-lies on tell u together: of an edge that all images see from one height, planes know the depth. The fourth is the share
-of normal residuals of r pixels root mean square within the width of an edge, a pixel: chords of curves fit no single
-line, and where segments of a curve are bowed their standard deviations, and with them r, say so.
+no texture, is told by contrast (:mod:`groma.features.contrast`), since texture has stripes of the same gradient beside
+it. Where views agree on texture, as they do on stripes of a wall, only this factor tells: stripes are found at the same
+place by any photographs. The logarithm of the contrast :math:`x_t` of stripes is normal with a mean and a deviation
+that texture has anywhere, as it is divided by its own surroundings; z is the logarithm of the likelihood ratio of edges
+to stripes. How far edges stand out is a matter of the scene: much on plain walls, little between rough stones. So the
+mean :math:`\mu` of edges is one of the scene, with a wide prior, and E the mean over what its lines say of it. Long
+lines among others, such as flights of steps, are edges though little contrast is left between them: stripes are short.
+The share of lines that are none, of log odds c, is estimated like the other. The third is the probability of an error
+within :math:`\tau = 0.0025`, where u is the standard deviation across the line that half of its places do not exceed,
+over the usual distance, and F the Student distribution of four degrees of freedom: errors have heavy tails, since what
+edges beside it displace is displaced in all images alike. Segments and the planes that the line lies on tell u
+together: of an edge that all images see from one height, planes know the depth. The fourth is the share of normal
+residuals of r pixels root mean square within the width of an edge, a pixel: chords of curves fit no single line, and
+where segments of a curve are bowed their standard deviations, and with them r, say so.
 
 No quantity depends on the unit of length or on how many pixels an image has. The weights were fitted on rendered scenes
 of boxes and round bodies whose edges are known exactly, and the probabilities compared with those of other scenes
@@ -56,10 +58,9 @@ from groma.mapping.lines.options import MIN_LENGTH
 from groma.mapping.noise.landmarks import LineNoise, line_end_rows, line_noise
 from groma.scene import Scene
 
-#: The quantities, and the weight of each as ``benchmarks/line_confidence.py`` found it.
+#: The quantities of the first factor, and the weight of each as ``benchmarks/line_confidence.py`` found it.
 WEIGHTS: dict[str, float] = {
-    "constant": 2.973, "spread": 1.118, "support": 1.476, "beside": 1.151, "residual": -0.927, "drift": -1.494,
-    "texture": -5.345, "prominence": 3.012,
+    "constant": 2.960, "spread": 1.172, "support": 1.508, "beside": 1.075, "residual": -0.962, "drift": -1.524,
 }  # fmt: skip
 
 
@@ -75,11 +76,20 @@ class ConfidenceGates:
         30.0, "lines", "that the prior on the share of lines with an edge counts for",
         "chosen on the scenes of the fit, each left out in turn",
     )  # fmt: skip
-    edge_prominence: float = gate(3.82, "1", "mean of edges", "derived from right lines of the fit")
-    stripe_prominence: float = gate(0.25, "1", "median of stripes", "derived from wrong lines of the fit")
-    prior_shift: float = gate(
-        300.0, "lines", "that the prior on the shift of prominences counts for", "chosen on rendered scenes"
+    stripe_contrast: tuple[float, float] = gate(
+        (0.75, 0.7), "1", "mean and deviation of the log contrast of stripes", "derived from stairs 3103"
     )
+    edge_contrast: tuple[float, float] = gate(
+        (3.0, 0.9),
+        "1",
+        "mean over scenes of that of edges, and its deviation",
+        "derived from rendered scenes and walls",
+    )
+    edge_deviation: float = gate(0.9, "1", "of the log contrast of edges of a scene", "derived from stairs and a room")
+    stripe_length: tuple[float, float] = gate(
+        (-0.16, 0.62), "1", "the same of the log length over the median of all lines", "derived from stairs"
+    )
+    edge_length: tuple[float, float] = gate((0.33, 0.86), "1", "that of edges", "derived from stairs")
     edge_px: float = gate(SEGMENTS.edge, "px", "residual of a segment of a right line", "derived from an edge's width")
     usual_contrast: float = gate(30.0, "1", "of segments whose contrast is unknown", "chosen on the scenes of the fit")
 
@@ -87,12 +97,10 @@ class ConfidenceGates:
 GATES = ConfidenceGates()
 #: Lines of a smaller probability are no part of a map: they are more likely wrong than right.
 DEFAULT_CONFIDENCE = 0.5
-#: Quantities of the two logistic models; the first of each is 1.
-TOGETHER, NO_TEXTURE = slice(0, 6), slice(6, 8)
 #: Largest logarithm of the odds of an edge, and how often the interval is halved in which they lie (cost: time).
 _MOST_ODDS, _HALVINGS = 40.0, 50
-#: How often the shift of prominences and the share of texture are estimated in turn (cost: time).
-_TURNS = 20
+#: Means of the contrast of edges that are weighed (cost: time).
+_MEANS = 31
 #: Smallest misfit and spread, below which they say nothing more.
 _MIN_MISFIT, _MIN_SPREAD = 0.3, 1e-4
 #: Shares of an information below which it is none: that of a line, and of the radius beside it (convention: rounding).
@@ -118,33 +126,53 @@ def edge_probability(evidence: FloatArray, weights: FloatArray) -> FloatArray:
     """Return the probability (L,) that there is an edge, from what :func:`line_evidence` returns and its weights.
 
     The lines are all those of a scene. Weights are of log likelihood ratios; the shares of lines whose segments belong
-    together, and of those among them that are no texture, are estimated from the lines, and so is how much too high
-    their prominences are.
+    together, and of those among them that are no texture, are estimated from the lines, as is the contrast of edges.
     """
-    together, no_texture = (evidence[:, part] @ weights[part] for part in (TOGETHER, NO_TEXTURE))
-    belongs, shift, edge = _with_share(together, np.ones(len(together))), 0.0, np.ones(len(together))
-    for _ in range(_TURNS):
-        edge = _with_share(no_texture - weights[-1] * shift, belongs)
-        usual = GATES.stripe_prominence + (GATES.edge_prominence - GATES.stripe_prominence) * edge
-        shift = max(float(belongs @ (evidence[:, -1] - usual)) / (GATES.prior_shift + float(belongs.sum())), 0.0)
-    return belongs * edge
+    expit, gates = scipy.special.expit, GATES
+    together, contrast, length = evidence[:, :-2] @ weights, *evidence[:, -2:].T
+    belongs = expit(together + _share_odds(together, np.ones(len(together))))
+    usual, spread = gates.edge_contrast
+    means = np.linspace(gates.stripe_contrast[0], usual + 3.0 * spread, _MEANS)[:, None]
+    ratio = _edge_ratio(contrast, gates.stripe_contrast, means, gates.edge_deviation)
+    ratio = ratio + _edge_ratio(length, gates.stripe_length, *gates.edge_length)
+    odds = _share_odds(ratio, belongs)
+    # Log likelihood of the lines over that if all were stripes, and the prior of the mean.
+    fit = (belongs * (np.logaddexp(0.0, ratio + odds) - np.logaddexp(0.0, odds))).sum(axis=1, keepdims=True)
+    fit -= 0.5 * ((means - usual) / spread) ** 2
+    weight = np.exp(fit - fit.max())
+    return belongs * (weight / weight.sum() * expit(ratio + odds)).sum(axis=0)
 
 
-def _with_share(ratio: FloatArray, count: FloatArray) -> FloatArray:
-    r"""Probabilities of log likelihood ratios z of lines that count :math:`n_i`, with a share of right ones that solves
+def _edge_ratio(
+    told: FloatArray, stripe: tuple[float, float], edge: float | FloatArray, edge_sigma: float
+) -> FloatArray:
+    """(..., L) log likelihood ratios of edges to stripes, both normal, given what is told of lines (L,).
+
+    ``stripe`` has mean and deviation; ``edge`` is one mean or several (M, 1). Edges vary more: below what has the
+    smallest ratio, less says nothing more.
+    """
+    mean, sigma = stripe
+    least = (mean / sigma**2 - edge / edge_sigma**2) / (sigma**-2.0 - edge_sigma**-2.0)
+    x = np.maximum(told, least)
+    return 0.5 * ((x - mean) / sigma) ** 2 - 0.5 * ((x - edge) / edge_sigma) ** 2 + math.log(sigma / edge_sigma)
+
+
+def _share_odds(ratio: FloatArray, count: FloatArray) -> FloatArray:
+    r"""Log odds b (..., 1) of the share of right lines, given log likelihood ratios z (..., L) of lines that count n.
 
     .. math:: \left(m + \sum_i n_i\right) \pi = \tfrac m2 + \sum_i \frac{n_i}{1 + \exp(-z_i - b)},
               \qquad b = \log\frac{\pi}{1 - \pi},
 
-    the fixed point of expectation maximisation, of which there is one.
+    is the fixed point of expectation maximisation, of which there is one.
     """
-    low, high, expit = -_MOST_ODDS, _MOST_ODDS, scipy.special.expit
+    low = np.full((*ratio.shape[:-1], 1), -_MOST_ODDS)
+    high, expit = -low, scipy.special.expit
     for _ in range(_HALVINGS):
         odds = 0.5 * (low + high)
-        expected = 0.5 * GATES.prior_lines + (count * expit(ratio + odds)).sum()
+        expected = 0.5 * GATES.prior_lines + (count * expit(ratio + odds)).sum(axis=-1, keepdims=True)
         more = expected > (count.sum() + GATES.prior_lines) * expit(odds)
-        low, high = (odds, high) if more else (low, odds)
-    return np.asarray(expit(ratio + low))
+        low, high = np.where(more, odds, low), np.where(more, high, odds)
+    return low
 
 
 def line_accuracy(
@@ -161,7 +189,9 @@ def line_accuracy(
 
 
 def line_evidence(scene: Scene, noise: LineNoise | None = None) -> FloatArray:
-    r"""Return what the probability that there is an edge is computed from, (L, 8), in the order of ``WEIGHTS``.
+    r"""Return what the probability that there is an edge is computed from, (L, 8).
+
+    The columns are the quantities of ``WEIGHTS``, in their order, then contrast and length.
 
     ``noise`` is that of the lines, if it is known.
 
@@ -174,9 +204,8 @@ def line_evidence(scene: Scene, noise: LineNoise | None = None) -> FloatArray:
     ``residual``    logarithm of the root mean square of its residuals, pixels
     ``drift``       logarithm of 1 + t, where t is how many standard deviations the radius is off zero of the cylinder
                     whose outlines explain its segments best
-    ``texture``     1
-    ``prominence``  mean over its segments of the logarithm of their contrast, plus that of its longest observed
-                    segment over the median of those of all lines
+    ``contrast``    mean over its segments of the logarithm of their contrast
+    ``length``      logarithm of the length of its longest segment over the median of those of all lines
     ==============  ===============================================================================================
     """
     seen, noise = scene.line_observations, line_noise(scene) if noise is None else noise
@@ -192,8 +221,8 @@ def line_evidence(scene: Scene, noise: LineNoise | None = None) -> FloatArray:
             np.log((images + 0.5) / (absent_beside + 0.5)),
             np.log(_residual_px(scene, noise)),
             np.log1p(np.abs(_drift(scene, noise))),
-            np.ones(scene.num_lines),
-            _log_contrast(scene) + np.log(longest / (np.median(longest) if len(longest) else 1.0)),
+            _log_contrast(scene),
+            np.log(longest / (np.median(longest) if len(longest) else 1.0)),
         ]
     )
 
