@@ -26,8 +26,8 @@ A segment takes part with its two end points; points on it count no more once it
 
 Everything is local: the number of candidates grows with the features, and each is scored, grown and judged where it was
 drawn. A scene has about the same planes whether it stands alone or is part of a larger one, and the time grows hardly
-faster than the features. What is searched once more, beside planes that are known by then, is only where features have
-become free: nothing else has changed for a candidate that is drawn there.
+faster than the features. What is searched once more, beside planes that are known by then, is only where neighbours
+have become free: elsewhere candidates were tried before.
 """
 
 from __future__ import annotations
@@ -177,8 +177,7 @@ class PlaneSearch:
         ----------
         known : PlaneSet, optional
             Planes beside which others are sought, in what has no label of theirs. They are the first that are returned.
-            After a first call candidates are drawn only where something has become free since then: elsewhere they
-            have been tried.
+            After a first call candidates are drawn only where neighbours have become free since then.
         progress : callable, optional
             Called with the number of candidates that are settled, and of all.
 
@@ -225,7 +224,9 @@ class PlaneSearch:
         def say(done: int, total: int) -> None:
             progress(settled + done, settled + total)
 
-        fresh, num_known = ~self._searched[features.given], len(found)
+        # What is drawn at a feature depends on its neighbours: where none has become free it was tried before.
+        fresh = ((labels < 0) & ~self._searched[features.given])[features.neighbours].any(axis=1)
+        num_known = len(found)
         for searched in (lambda: features, rough):
             if np.count_nonzero(labels < 0) < options.min_support:
                 break  # too few are left
