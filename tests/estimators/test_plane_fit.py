@@ -2,11 +2,13 @@
 """Planes: fit and covariance, search among clutter and in large scenes, connectedness, segments, membership."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from groma.errors import InputError, ShapeError
+from groma.estimators import plane_search
 from groma.estimators._plane_candidates import features_of, from_planes
 from groma.estimators.association import inlier_probability
 from groma.estimators.plane_fit import fit_plane, tilt_sigma
@@ -187,6 +189,25 @@ def test_narrow_faces_beside_each_other():
         assert (np.abs(found.planes[:, 1:3]).max(axis=1) > np.cos(0.1)).all()  # no slope through all of them
         number += len(found)
     assert number >= 60
+
+
+@pytest.mark.kernels
+def test_parallels_are_drawn_again_only_beside_planes_that_are_new(monkeypatch):
+    calls = []
+
+    def recorded(features, planes, labels, fresh, rng):
+        calls.append((features, len(planes), labels.copy(), fresh))
+        return from_planes(features, planes, labels, fresh, rng)
+
+    monkeypatch.setattr(plane_search, "from_planes", recorded)
+    points, edges, noise = stairs(0)
+    noises = (np.broadcast_to(noise, (len(points), 3, 3)), np.broadcast_to(noise, (len(edges), 2, 3, 3)))
+    find_planes(points, noises[0], edges, noises[1])
+    calls = [call for call in calls if not call[0].rough]
+    assert len(calls) > 1 and calls[0][3].all()
+    for (_, before, _, _), (features, _, labels, fresh) in pairwise(calls):
+        np.testing.assert_array_equal(fresh, (labels >= before)[features.neighbours].any(axis=1))
+        assert fresh.mean() < 0.9
 
 
 @pytest.mark.kernels

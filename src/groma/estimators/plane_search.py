@@ -13,9 +13,9 @@ points have their neighbours there anyway. It is kept if
   through its sides, nor a round body one that touches it.
 
 Narrow faces, such as treads, have few neighbours on themselves, so that few of the planes drawn are theirs. They are
-parallel to faces beside them, or at right angles to two: such planes through what is left are drawn next, as long as
-any are found. And the edges of a face are on two: what was taken out with another plane counts in the test against
-chance, if it is a segment, both ends of which are on this one, too.
+parallel to faces beside them, or at right angles to two: such planes through what is left are drawn next, and then
+beside those that this finds, as long as any are found. And the edges of a face are on two: what was taken out with
+another plane counts in the test against chance, if it is a segment, both ends of which are on this one, too.
 
 What is left is searched again as rough walls, by features with four times the noise. As neighbours deviate alike on
 these, their number does not make the normal better known: the noise is at most ``max_tilt`` of the spread of the plane
@@ -39,7 +39,7 @@ from heapq import heappop, heappush
 
 import numpy as np
 
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError, ShapeError, given_or_default
 from groma.estimators._plane_candidates import (
     Features,
@@ -225,7 +225,7 @@ class PlaneSearch:
             progress(settled + done, settled + total)
 
         # What is drawn at a feature depends on its neighbours: where none has become free it was tried before.
-        fresh = ((labels < 0) & ~self._searched[features.given])[features.neighbours].any(axis=1)
+        fresh = _beside(features, (labels < 0) & ~self._searched[features.given])
         num_known = len(found)
         for searched in (lambda: features, rough):
             if np.count_nonzero(labels < 0) < options.min_support:
@@ -236,16 +236,22 @@ class PlaneSearch:
             first, first_homes = from_neighbours(one, free, fresh, gate, rng)
             second, second_homes, num_pairs = from_segments(one, corner[(labels[corner] < 0).all(axis=1)], gate, fresh)
             candidates, homes = np.concatenate([first, second]), np.concatenate([first_homes, second_homes])
-            num_tried = len(first) + num_pairs
+            num_tried, drawn_at, num_drawn = len(first) + num_pairs, fresh, num_known
             while number < len(found):
                 number = len(found)
                 _extract_of(one, candidates, homes, num_tried, labels, found, options, say)
                 settled += len(candidates)
                 planes = np.array([grown.fit.plane for grown in found]).reshape(-1, 4)
-                beside = (labels >= num_known)[one.neighbours].any(axis=1)
-                candidates, homes = from_planes(one, planes, labels, fresh | beside, rng)
+                drawn_at = drawn_at | _beside(one, labels >= num_drawn)
+                candidates, homes = from_planes(one, planes, labels, drawn_at, rng)
+                drawn_at, num_drawn = np.zeros_like(fresh), len(found)
                 num_tried += len(candidates)
         filled[features.given] = labels
+
+
+def _beside(features: Features, some: BoolArray) -> BoolArray:
+    """(N,) features that have one of some (N,) among their neighbours."""
+    return np.asarray(some[features.neighbours].any(axis=1))
 
 
 def _extract_of(
