@@ -32,7 +32,6 @@ _JUDGES = 64
 #: handing over a tenth. And pieces, as some candidates take longer than others (cost: time only).
 _DRAWN_AT_ONCE, _SCORED_AT_ONCE, _PIECES = 1024, 256, 32
 
-
 #: Where the entries of a covariance, and those of its diagonal, are among the packed ones (derived from
 #: their order).
 _UNPACKED, _DIAGONAL = [0, 1, 2, 1, 3, 4, 2, 4, 5], [0, 3, 5]
@@ -164,10 +163,7 @@ def _through_neighbours(places, packed, neighbours, seed, choice, limit, rounds,
 def from_neighbours(
     features: Features, free: IntArray, fresh: BoolArray, gate: float, rng: np.random.Generator
 ) -> tuple[FloatArray, IntArray]:
-    """Candidates (H, 4) from a free feature and two neighbours, improved on the neighbourhood; their homes (H,).
-
-    Of those drawn the ones at ``fresh`` features (N,) are kept.
-    """
+    """Candidates (H, 4) from free ``fresh`` features (N,), their homes (H,), and two neighbours, improved there."""
     number, near = len(free), features.neighbours.shape[1]
     count = max(number // PLANE_SEARCH.features_per_seed, min(PLANE_SEARCH.min_seeds, PLANE_SEARCH.repeated * number))
     seed = free[rng.permutation(np.repeat(np.arange(number), -(-count // number)))[:count]]
@@ -189,9 +185,7 @@ def from_neighbours(
 def from_planes(
     features: Features, planes: FloatArray, labels: IntArray, fresh: BoolArray, rng: np.random.Generator
 ) -> tuple[FloatArray, IntArray]:
-    """Candidates (H, 4) through free features, parallel to planes (K, 4) that neighbours are on, or at right angles to
-    two of them; their homes (H,), ``fresh`` ones (N,).
-    """
+    """Candidates (H, 4) at free ``fresh`` features (N,), their homes (H,): parallel to planes beside, or across two."""
     free = np.flatnonzero(labels < 0)
     seed = np.sort(rng.permutation(free)[: max(len(free) // PLANE_SEARCH.features_per_seed, PLANE_SEARCH.min_seeds)])
     seed = seed[fresh[seed]]
@@ -212,8 +206,7 @@ def from_segments(
 ) -> tuple[FloatArray, IntArray, int]:
     """Candidates (H, 4) from near segments that are coplanar within their noise, their homes, and how many were tried.
 
-    Of the pairs of a segment, those that fix their plane best, of pairs with ``fresh`` ends (N,). ``corner`` (L, 2) has
-    the ends of the segments.
+    Of the pairs of a segment with ``fresh`` ends (N,), those that fix their plane best; ``corner`` (L, 2) has the ends.
     """
     ends = features.places[corner]
     if len(ends) < 2:
