@@ -80,6 +80,8 @@ def nearest_loop(points, boxes, first, place, bound, nearest, squared):
     """
     count, width, level = 0, len(nearest), 0
     x, y, z = place[0], place[1], place[2]
+    if not _squared_kernel(boxes[1], x, y, z) < bound:
+        return 0
     while len(boxes) >> (level + 2):
         level += 1
     node, home = 1, box_near_kernel(boxes, x, y, z)
@@ -116,13 +118,15 @@ def _distance_kernel(a, b):
 
 
 @loop
-def _nearest_points_loop(points, places, index, distance):
-    """Write which points (M, n) are nearest to places (M, 3), and their distances (M, n)."""
+def _nearest_points_loop(points, places, within, index, distance):
+    """Write which points (M, n) are nearest to places (M, 3), and their distances (M, n), up to ``within`` (M,)."""
     squared, (boxes, first) = np.empty(index.shape[1]), boxes_loop(points)
     for k in range(len(places)):
-        count = nearest_loop(points, boxes, first, places[k], np.inf, index[k], squared)
+        count = nearest_loop(points, boxes, first, places[k], within[k] * within[k] * ROUNDING, index[k], squared)
         for m in range(count):
             distance[k, m] = _distance_kernel(points[index[k, m]], places[k])
+        while count > 0 and distance[k, count - 1] > within[k]:
+            count -= 1
         for m in range(count, index.shape[1]):
             index[k, m], distance[k, m] = len(points), np.inf
 
@@ -143,13 +147,16 @@ def nearest(tree: KDTree, places: FloatArray, number: int) -> tuple[FloatArray, 
     return distance, np.append(tree.indices, tree.n)[index]
 
 
-def nearest_in_order(points: FloatArray, places: FloatArray, number: int) -> tuple[FloatArray, IntArray]:
-    """Do what :func:`nearest` does, with points (N, d) of which near ones are together."""
+def nearest_in_order(
+    points: FloatArray, places: FloatArray, number: int, within: FloatArray | float = np.inf
+) -> tuple[FloatArray, IntArray]:
+    """Do what :func:`nearest` does, with points (N, d) of which near ones are together, up to a distance, also (M,)."""
+    within = np.broadcast_to(within, len(places)).astype(np.float64)
     distance, index = np.empty((len(places), number)), np.empty((len(places), number), np.int64)
     points, places = (np.pad(one, ((0, 0), (0, 3 - one.shape[1]))) for one in (points, places))
 
     def look_up(part: slice) -> None:
-        _nearest_points_loop(points, places[part], index[part], distance[part])
+        _nearest_points_loop(points, places[part], within[part], index[part], distance[part])
 
     map_ranges(look_up, len(places), max(_PLACES_AT_ONCE, -(-len(places) // _PIECES)))
     return distance, index

@@ -2,15 +2,17 @@
 """Planes: fit and covariance, search among clutter and in large scenes, connectedness, segments, membership."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from groma.errors import InputError, ShapeError
+from groma.estimators import plane_search
 from groma.estimators._plane_candidates import features_of, from_planes
 from groma.estimators.association import inlier_probability
 from groma.estimators.plane_fit import fit_plane, tilt_sigma
-from groma.estimators.plane_search import PlaneOptions, find_planes
+from groma.estimators.plane_search import PlaneOptions, PlaneSearch
 from groma.execution import work_with
 
 SIGMA = 0.01
@@ -24,6 +26,10 @@ def wall(rng, count, normal_axis, offset, size=4.0, shift=(0.0, 0.0)):
 
 def noise_of(points):
     return np.broadcast_to(SIGMA**2 * np.eye(3), (len(points), 3, 3))
+
+
+def find_planes(points, *given, **named):
+    return PlaneSearch(points, *given, **named).planes()
 
 
 @pytest.mark.kernels
@@ -86,11 +92,32 @@ def test_others_are_found_beside_planes_that_are_known():
     points = np.concatenate([wall(rng, 300, 0, 0.0), wall(rng, 300, 1, 0.0), wall(rng, 200, 2, 0.0)])
     found = find_planes(points, noise_of(points))
     known = found.take(np.array([1]), np.array([-1, 0, -1]))
-    again = find_planes(points, noise_of(points), known=known)
+    again = PlaneSearch(points, noise_of(points)).planes(known)
     assert len(found) == len(again) == 3
     np.testing.assert_array_equal(again.planes[0], found.planes[1])
     assert (again.point_label == 0)[known.point_label == 0].all()
     assert sorted(np.abs(again.planes[:, :3]).argmax(axis=1)) == [0, 1, 2]
+
+
+def test_planes_are_searched_again_only_where_features_have_become_free():
+    rng = np.random.default_rng(2)
+    walls = [wall(rng, 300, 0, 0.0), wall(rng, 300, 1, 0.0), wall(rng, 200, 2, 0.0)]
+    points, tried = np.concatenate([*walls, rng.uniform(0.5, 4, (300, 3))]), []
+    search = PlaneSearch(points, noise_of(points))
+
+    def candidates(known=None):
+        tried.append(0)
+        return search.planes(known, lambda done, total: tried.__setitem__(-1, total))
+
+    found = candidates()
+    same = candidates(found)
+    np.testing.assert_array_equal(same.planes, found.planes)
+    np.testing.assert_array_equal(same.point_label, found.point_label)
+    again = candidates(found.take(np.array([0, 1]), np.array([0, 1, -1])))
+    assert len(again) == 3
+    np.testing.assert_allclose(again.planes[2], found.planes[2], atol=SIGMA)
+    first, second, third = tried
+    assert second == 0 and 0 < third < 0.5 * first  # 200 features in 1,100 are free again
 
 
 def test_no_plane_in_clutter_and_none_in_a_blob():
@@ -165,6 +192,25 @@ def test_narrow_faces_beside_each_other():
 
 
 @pytest.mark.kernels
+def test_parallels_are_drawn_again_only_beside_planes_that_are_new(monkeypatch):
+    calls = []
+
+    def recorded(features, planes, labels, fresh, rng):
+        calls.append((features, len(planes), labels.copy(), fresh))
+        return from_planes(features, planes, labels, fresh, rng)
+
+    monkeypatch.setattr(plane_search, "from_planes", recorded)
+    points, edges, noise = stairs(0)
+    noises = (np.broadcast_to(noise, (len(points), 3, 3)), np.broadcast_to(noise, (len(edges), 2, 3, 3)))
+    find_planes(points, noises[0], edges, noises[1])
+    calls = [call for call in calls if not call[0].rough]
+    assert len(calls) > 1 and calls[0][3].all()
+    for (_, before, _, _), (features, _, labels, fresh) in pairwise(calls):
+        np.testing.assert_array_equal(fresh, (labels >= before)[features.neighbours].any(axis=1))
+        assert fresh.mean() < 0.9
+
+
+@pytest.mark.kernels
 def test_candidates_are_parallel_to_planes_beside_them_and_at_right_angles_to_two():
     rng = np.random.default_rng(3)
     points = np.concatenate(
@@ -173,15 +219,16 @@ def test_candidates_are_parallel_to_planes_beside_them_and_at_right_angles_to_tw
     features = features_of(points, np.array(noise_of(points)), np.arange(240), np.full(240, -1))
     wall_of = np.repeat(np.arange(4), 60)[features.given]
     labels, planes = np.where(wall_of < 2, wall_of, -1), np.array([[1.0, 0, 0, 0], [0.0, 1, 0, 0]])
-    found, homes = from_planes(features, planes, labels, rng)
+    everywhere = np.full(240, True)
+    found, homes = from_planes(features, planes, labels, everywhere, rng)
     assert np.abs(np.einsum("ni,ni->n", found[:, :3], features.places[homes]) + found[:, 3]).max() < 1e-12
     assert set(wall_of[homes]) == {2}  # nothing is known beside the wall far away
     assert {tuple(np.abs(normal)) for normal in found[:, :3].round(12)} == {(1, 0, 0), (0, 1, 0), (0, 0, 1)}
     near = features.neighbours[homes]
     for axis in range(2):
         assert (labels[near[np.abs(found[:, axis]) == 1.0]] == axis).any(axis=1).all()
-    assert len(from_planes(features, planes, np.full(240, -1), rng)[0]) == 0
-    assert len(from_planes(features, planes, np.zeros(240, int), rng)[0]) == 0
+    assert len(from_planes(features, planes, np.full(240, -1), everywhere, rng)[0]) == 0
+    assert len(from_planes(features, planes, np.zeros(240, int), everywhere, rng)[0]) == 0
 
 
 def test_a_round_body_has_no_plane():

@@ -32,7 +32,6 @@ _JUDGES = 64
 #: handing over a tenth. And pieces, as some candidates take longer than others (cost: time only).
 _DRAWN_AT_ONCE, _SCORED_AT_ONCE, _PIECES = 1024, 256, 32
 
-
 #: Where the entries of a covariance, and those of its diagonal, are among the packed ones (derived from
 #: their order).
 _UNPACKED, _DIAGONAL = [0, 1, 2, 1, 3, 4, 2, 4, 5], [0, 3, 5]
@@ -162,14 +161,15 @@ def _through_neighbours(places, packed, neighbours, seed, choice, limit, rounds,
 
 
 def from_neighbours(
-    features: Features, free: IntArray, gate: float, rng: np.random.Generator
+    features: Features, free: IntArray, fresh: BoolArray, gate: float, rng: np.random.Generator
 ) -> tuple[FloatArray, IntArray]:
-    """Candidates (H, 4) from a free feature and two neighbours, improved on the neighbourhood; their homes (H,)."""
+    """Candidates (H, 4) from free ``fresh`` features (N,), their homes (H,), and two neighbours, improved there."""
     number, near = len(free), features.neighbours.shape[1]
     count = max(number // PLANE_SEARCH.features_per_seed, min(PLANE_SEARCH.min_seeds, PLANE_SEARCH.repeated * number))
     seed = free[rng.permutation(np.repeat(np.arange(number), -(-count // number)))[:count]]
-    choice = rng.integers(1, near, (count, 2))
-    planes = np.empty((count, 4))
+    choice = rng.integers(1, near, (count, 2))[fresh[seed]]
+    seed = seed[fresh[seed]]
+    planes = np.empty((len(seed), 4))
 
     def draw(part: slice) -> None:
         _through_neighbours(
@@ -177,19 +177,18 @@ def from_neighbours(
             PLANE_SEARCH.rounds, planes[part]
         )  # fmt: skip
 
-    map_ranges(draw, count, _DRAWN_AT_ONCE)
+    map_ranges(draw, len(seed), _DRAWN_AT_ONCE)
     valid = planes[:, :3].any(axis=1)
     return planes[valid], seed[valid]
 
 
 def from_planes(
-    features: Features, planes: FloatArray, labels: IntArray, rng: np.random.Generator
+    features: Features, planes: FloatArray, labels: IntArray, fresh: BoolArray, rng: np.random.Generator
 ) -> tuple[FloatArray, IntArray]:
-    """Candidates (H, 4) through free features, parallel to planes (K, 4) that neighbours are on, or at right angles to
-    two of them; their homes (H,).
-    """
+    """Candidates (H, 4) at free ``fresh`` features (N,), their homes (H,): parallel to planes beside, or across two."""
     free = np.flatnonzero(labels < 0)
     seed = np.sort(rng.permutation(free)[: max(len(free) // PLANE_SEARCH.features_per_seed, PLANE_SEARCH.min_seeds)])
+    seed = seed[fresh[seed]]
     label = np.sort(labels[features.neighbours[seed]], axis=1)
     label = np.sort(np.where(np.diff(label, axis=1, prepend=-1) > 0, label, -1), axis=1)[:, ::-1]
     first, second = np.triu_indices(max(int((label >= 0).sum(axis=1).max(initial=0)), 1))
@@ -202,10 +201,12 @@ def from_planes(
     return np.column_stack([normal, -dot(normal, features.places[homes])]), homes
 
 
-def from_segments(features: Features, corner: IntArray, gate: float) -> tuple[FloatArray, IntArray, int]:
+def from_segments(
+    features: Features, corner: IntArray, gate: float, fresh: BoolArray
+) -> tuple[FloatArray, IntArray, int]:
     """Candidates (H, 4) from near segments that are coplanar within their noise, their homes, and how many were tried.
 
-    Of the pairs of a segment, those that fix their plane best. ``corner`` (L, 2) has the ends of the segments.
+    Of the pairs of a segment with ``fresh`` ends (N,), those that fix their plane best; ``corner`` (L, 2) has the ends.
     """
     ends = features.places[corner]
     if len(ends) < 2:
@@ -216,7 +217,8 @@ def from_segments(features: Features, corner: IntArray, gate: float) -> tuple[Fl
     first, second = np.repeat(np.arange(len(ends)), count - 1), near[:, 1:].ravel()
     keys = np.sort((np.minimum(first, second) * len(ends) + np.maximum(first, second))[first != second])
     once = np.column_stack(np.divmod(keys[np.diff(keys, prepend=-1) > 0], len(ends)))
-    chunks = [once[k : k + _CHUNK] for k in range(0, len(once), _CHUNK)]
+    once = once[fresh[corner[once]].any(axis=(1, 2))]
+    chunks = [once[k : k + _CHUNK] for k in range(0, max(len(once), 1), _CHUNK)]
     parts = map_in_threads(partial(_coplanar, features, corner, gate), chunks)
     pairs, planes, worth = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.lexsort((-worth, pairs[:, 0]))

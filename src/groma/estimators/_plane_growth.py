@@ -318,5 +318,5 @@ def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, pl
     """
     height, height_of_places = (at @ plane[:3] + plane[3] for at in (tested, places))
     flat = places - height_of_places[:, None] * plane[:3]
-    distance, _ = nearest_in_order(flat, tested - height[:, None] * plane[:3], 1)
-    return np.asarray(distance[:, 0] <= GATES.link * spacing)
+    distance, _ = nearest_in_order(flat, tested - height[:, None] * plane[:3], 1, GATES.link * spacing)
+    return np.asarray(distance[:, 0] < np.inf)

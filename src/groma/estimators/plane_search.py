@@ -13,9 +13,9 @@ points have their neighbours there anyway. It is kept if
   through its sides, nor a round body one that touches it.
 
 Narrow faces, such as treads, have few neighbours on themselves, so that few of the planes drawn are theirs. They are
-parallel to faces beside them, or at right angles to two: such planes through what is left are drawn next, as long as
-any are found. And the edges of a face are on two: what was taken out with another plane counts in the test against
-chance, if it is a segment, both ends of which are on this one, too.
+parallel to faces beside them, or at right angles to two: such planes through what is left are drawn next, and then
+beside those that this finds, as long as any are found. And the edges of a face are on two: what was taken out with
+another plane counts in the test against chance, if it is a segment, both ends of which are on this one, too.
 
 What is left is searched again as rough walls, by features with four times the noise. As neighbours deviate alike on
 these, their number does not make the normal better known: the noise is at most ``max_tilt`` of the spread of the plane
@@ -26,7 +26,8 @@ A segment takes part with its two end points; points on it count no more once it
 
 Everything is local: the number of candidates grows with the features, and each is scored, grown and judged where it was
 drawn. A scene has about the same planes whether it stands alone or is part of a larger one, and the time grows hardly
-faster than the features.
+faster than the features. What is searched once more, beside planes that are known by then, is only where neighbours
+have become free: elsewhere candidates were tried before.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from heapq import heappop, heappush
 
 import numpy as np
 
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError, ShapeError, given_or_default
 from groma.estimators._plane_candidates import (
     Features,
@@ -105,17 +106,8 @@ class PlaneSet:
         )
 
 
-def find_planes(
-    points: FloatArray,
-    covariances: FloatArray,
-    segments: FloatArray | None = None,
-    segment_covariances: FloatArray | None = None,
-    options: PlaneOptions | None = None,
-    carriers: IntArray | None = None,
-    progress: Callable[[int, int], None] | None = None,
-    known: PlaneSet | None = None,
-) -> PlaneSet:
-    """Find planes in points and segments; see the module.
+class PlaneSearch:
+    """Searches for planes in points and segments; see the module.
 
     Parameters
     ----------
@@ -132,106 +124,134 @@ def find_planes(
     carriers : (N,) int, optional
         The segment that each point lies on, -1 for none. With a segment on a plane its points are there too, and say
         nothing more about whether there is a plane.
-    progress : callable, optional
-        Called with the number of candidates that are settled, and of all.
-    known : PlaneSet, optional
-        Planes beside which others are sought, in what has no label of theirs. They are the first that are returned.
-
-    Returns
-    -------
-    PlaneSet
-        Each with what was taken out for it. A feature near two planes is given to one of them here.
 
     Raises
     ------
     ShapeError, InputError
         If shapes do not fit or numbers are not finite.
     """
-    options = given_or_default(options, PlaneOptions)
-    points = vectors(points, 3, "points")
-    ends = np.zeros((0, 2, 3)) if segments is None else vectors(segments, 3, "segments")
-    end_noise = np.zeros((0, 2, 3, 3)) if segment_covariances is None else np.asarray(segment_covariances, float)
-    covariances = np.asarray(covariances, dtype=np.float64)
-    if covariances.shape != (len(points), 3, 3) or end_noise.shape != (len(ends), 2, 3, 3):
-        raise ShapeError(
-            f"covariances must have shapes ({len(points)}, 3, 3) and ({len(ends)}, 2, 3, 3), as points and segments; "
-            f"got {covariances.shape} and {end_noise.shape}."
+
+    def __init__(
+        self,
+        points: FloatArray,
+        covariances: FloatArray,
+        segments: FloatArray | None = None,
+        segment_covariances: FloatArray | None = None,
+        options: PlaneOptions | None = None,
+        carriers: IntArray | None = None,
+    ) -> None:
+        self._options = given_or_default(options, PlaneOptions)
+        points = vectors(points, 3, "points")
+        ends = np.zeros((0, 2, 3)) if segments is None else vectors(segments, 3, "segments")
+        end_noise = np.zeros((0, 2, 3, 3)) if segment_covariances is None else np.asarray(segment_covariances, float)
+        covariances = np.asarray(covariances, dtype=np.float64)
+        if covariances.shape != (len(points), 3, 3) or end_noise.shape != (len(ends), 2, 3, 3):
+            raise ShapeError(
+                f"covariances must have shapes ({len(points)}, 3, 3) and ({len(ends)}, 2, 3, 3), as points and "
+                f"segments; got {covariances.shape} and {end_noise.shape}."
+            )
+        places = np.concatenate([points, ends.reshape(-1, 3)])
+        noise = np.concatenate([covariances, end_noise.reshape(-1, 3, 3)])
+        if not (np.isfinite(places).all() and np.isfinite(noise).all()):
+            raise InputError("Points, segments and their covariances must be finite. Remove the rows that are not.")
+        carrier = np.full(len(points), -1) if carriers is None else np.asarray(carriers)
+        if carrier.shape != (len(points),) or (len(carrier) and carrier.max() >= len(ends)):
+            raise ShapeError(
+                f"carriers must have shape ({len(points)},) and refer to the {len(ends)} segments; got {carrier.shape}."
+            )
+        carrier = np.concatenate([np.where(carrier >= 0, len(points) + 2 * carrier, -1), np.full(2 * len(ends), -1)])
+        partner = np.arange(len(places))
+        partner[len(points) :] = len(points) + (np.arange(2 * len(ends)) ^ 1)
+        self._num_points = len(points)
+        self._features: tuple[Features, Callable[[], Features]] | None = None
+        if len(places) >= max(self._options.min_support, 4):  # derived from three that fix a plane
+            features = features_of(places, noise, partner, carrier)
+            self._features = features, begin(partial(features.thicker, PLANE_SEARCH.thicker))
+        #: (N,) features that stayed free when planes were sought last; none before.
+        self._searched = np.zeros(len(places), bool)
+
+    def planes(self, known: PlaneSet | None = None, progress: Callable[[int, int], None] | None = None) -> PlaneSet:
+        """Find planes.
+
+        Parameters
+        ----------
+        known : PlaneSet, optional
+            Planes beside which others are sought, in what has no label of theirs. They are the first that are returned.
+            After a first call candidates are drawn only where neighbours have become free since then.
+        progress : callable, optional
+            Called with the number of candidates that are settled, and of all.
+
+        Returns
+        -------
+        PlaneSet
+            Each with what was taken out for it. A feature near two planes is given to one of them here.
+        """
+        labels, found = np.full(len(self._searched), -1), list[Grown]()
+        if known is not None:
+            labels = np.concatenate([known.point_label, np.repeat(known.segment_label, 2)])
+            fits = [PlaneFit(*one, 1.0) for one in zip(known.planes, known.covariance, strict=True)]
+            rest = known.share, known.band, known.log10_false_alarms, known.places, [_NONE] * len(fits)
+            found = [Grown(*one) for one in zip(fits, *rest, strict=True)]
+        if self._features is not None:
+            self._extract(*self._features, labels, found, progress or (lambda done, total: None))
+        self._searched = labels < 0
+        fits = [grown.fit for grown in found]
+        end_label = labels[self._num_points :].reshape(-1, 2)
+        return PlaneSet(
+            planes=np.array([fit.plane for fit in fits]).reshape(-1, 4),
+            covariance=np.array([fit.covariance for fit in fits]).reshape(-1, 4, 4),
+            support=np.array([len(grown.places) for grown in found], dtype=np.int64),
+            share=np.array([grown.share for grown in found], dtype=np.float64),
+            band=np.array([grown.band for grown in found], dtype=np.float64),
+            log10_false_alarms=np.array([grown.log10_false_alarms for grown in found], dtype=np.float64),
+            point_label=labels[: self._num_points],
+            segment_label=np.where(end_label[:, 0] == end_label[:, 1], end_label[:, 0], -1),
+            places=[grown.places for grown in found],
         )
-    places = np.concatenate([points, ends.reshape(-1, 3)])
-    noise = np.concatenate([covariances, end_noise.reshape(-1, 3, 3)])
-    if not (np.isfinite(places).all() and np.isfinite(noise).all()):
-        raise InputError("Points, segments and their covariances must be finite. Remove the rows that are not.")
-    carrier = np.full(len(points), -1) if carriers is None else np.asarray(carriers)
-    if carrier.shape != (len(points),) or (len(carrier) and carrier.max() >= len(ends)):
-        raise ShapeError(
-            f"carriers must have shape ({len(points)},) and refer to the {len(ends)} segments; got {carrier.shape}."
-        )
-    carrier = np.concatenate([np.where(carrier >= 0, len(points) + 2 * carrier, -1), np.full(2 * len(ends), -1)])
-    partner = np.arange(len(places))
-    partner[len(points) :] = len(points) + (np.arange(2 * len(ends)) ^ 1)
-    labels = np.full(len(places), -1)
-    say = progress or (lambda done, total: None)
-    found: list[Grown] = []
-    if known is not None:
-        labels = np.concatenate([known.point_label, np.repeat(known.segment_label, 2)])
-        fits = [PlaneFit(*one, 1.0) for one in zip(known.planes, known.covariance, strict=True)]
-        rest = known.share, known.band, known.log10_false_alarms, known.places, [_NONE] * len(fits)
-        found = [Grown(*one) for one in zip(fits, *rest, strict=True)]
-    if len(places) >= max(options.min_support, 4):  # derived from three that fix a plane
-        _extract(places, noise, partner, carrier, len(points), labels, found, options, say)
-    fits = [grown.fit for grown in found]
-    end_label = labels[len(points) :].reshape(-1, 2)
-    return PlaneSet(
-        planes=np.array([fit.plane for fit in fits]).reshape(-1, 4),
-        covariance=np.array([fit.covariance for fit in fits]).reshape(-1, 4, 4),
-        support=np.array([len(grown.places) for grown in found], dtype=np.int64),
-        share=np.array([grown.share for grown in found], dtype=np.float64),
-        band=np.array([grown.band for grown in found], dtype=np.float64),
-        log10_false_alarms=np.array([grown.log10_false_alarms for grown in found], dtype=np.float64),
-        point_label=labels[: len(points)],
-        segment_label=np.where(end_label[:, 0] == end_label[:, 1], end_label[:, 0], -1),
-        places=[grown.places for grown in found],
-    )
+
+    def _extract(
+        self,
+        features: Features,
+        rough: Callable[[], Features],
+        filled: IntArray,
+        found: list[Grown],
+        progress: Callable[[int, int], None],
+    ) -> None:
+        """Find planes, then rough ones, beside those ``found``, which is added to; ``filled`` gets their numbers."""
+        options, labels = self._options, filled[features.given]
+        gate, settled = chi_square_gate(1.0 - options.level, 1), 0
+
+        def say(done: int, total: int) -> None:
+            progress(settled + done, settled + total)
+
+        # What is drawn at a feature depends on its neighbours: where none has become free it was tried before.
+        fresh = _beside(features, (labels < 0) & ~self._searched[features.given])
+        num_known = len(found)
+        for searched in (lambda: features, rough):
+            if np.count_nonzero(labels < 0) < options.min_support:
+                break  # too few are left
+            one = searched()
+            rng, number = np.random.default_rng(options.seed), -1
+            free, corner = one.position[labels[one.position] < 0], one.position[self._num_points :].reshape(-1, 2)
+            first, first_homes = from_neighbours(one, free, fresh, gate, rng)
+            second, second_homes, num_pairs = from_segments(one, corner[(labels[corner] < 0).all(axis=1)], gate, fresh)
+            candidates, homes = np.concatenate([first, second]), np.concatenate([first_homes, second_homes])
+            num_tried, drawn_at, num_drawn = len(first) + num_pairs, fresh, num_known
+            while number < len(found):
+                number = len(found)
+                _extract_of(one, candidates, homes, num_tried, labels, found, options, say)
+                settled += len(candidates)
+                planes = np.array([grown.fit.plane for grown in found]).reshape(-1, 4)
+                drawn_at = drawn_at | _beside(one, labels >= num_drawn)
+                candidates, homes = from_planes(one, planes, labels, drawn_at, rng)
+                drawn_at, num_drawn = np.zeros_like(fresh), len(found)
+                num_tried += len(candidates)
+        filled[features.given] = labels
 
 
-def _extract(
-    places: FloatArray,
-    noise: FloatArray,
-    partner: IntArray,
-    carrier: IntArray,
-    num_points: int,
-    filled: IntArray,
-    found: list[Grown],
-    options: PlaneOptions,
-    progress: Callable[[int, int], None],
-) -> None:
-    """Find planes, then rough ones, beside those ``found``, which is added to; ``filled`` gets their numbers."""
-    features = features_of(places, noise, partner, carrier)
-    labels = filled[features.given]
-    gate, settled = chi_square_gate(1.0 - options.level, 1), 0
-
-    def say(done: int, total: int) -> None:
-        progress(settled + done, settled + total)
-
-    rough = begin(partial(features.thicker, PLANE_SEARCH.thicker))
-    for searched in (lambda: features, rough):
-        if np.count_nonzero(labels < 0) < options.min_support:
-            break  # too few are left
-        one = searched()
-        rng, number = np.random.default_rng(options.seed), -1
-        free, corner = one.position[labels[one.position] < 0], one.position[num_points:].reshape(-1, 2)
-        first, first_homes = from_neighbours(one, free, gate, rng)
-        second, second_homes, num_pairs = from_segments(one, corner[(labels[corner] < 0).all(axis=1)], gate)
-        candidates, homes = np.concatenate([first, second]), np.concatenate([first_homes, second_homes])
-        num_tried = len(first) + num_pairs
-        while number < len(found):
-            number = len(found)
-            _extract_of(one, candidates, homes, num_tried, labels, found, options, say)
-            settled += len(candidates)
-            planes = np.array([grown.fit.plane for grown in found]).reshape(-1, 4)
-            candidates, homes = from_planes(one, planes, labels, rng)
-            num_tried += len(candidates)
-    filled[features.given] = labels
+def _beside(features: Features, some: BoolArray) -> BoolArray:
+    """(N,) features that have one of some (N,) among their neighbours."""
+    return np.asarray(some[features.neighbours].any(axis=1))
 
 
 def _extract_of(
@@ -313,4 +333,4 @@ class _Queue:
             heappush(self._queue, (-float(score[k]), int(which[k])))
 
 
-__all__ = ["BAND", "PlaneOptions", "PlaneSet", "connected_to", "find_planes"]
+__all__ = ["BAND", "PlaneOptions", "PlaneSearch", "PlaneSet", "connected_to"]

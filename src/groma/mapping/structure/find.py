@@ -27,7 +27,7 @@ from groma.adjustment.assembly_options import SURFACE_SIGMA_PX
 from groma.adjustment.terms.relations import ANGLES, lengths_per_pixel
 from groma.errors import InputError, given_or_default
 from groma.estimators.directions import DirectionOptions, DirectionSet, directions_from_lines
-from groma.estimators.plane_search import PlaneOptions, PlaneSet, find_planes
+from groma.estimators.plane_search import PlaneOptions, PlaneSearch, PlaneSet
 from groma.execution import begin, together
 from groma.geometry.algebra import norm
 from groma.mapping.groups import num_distinct
@@ -157,7 +157,7 @@ def detect_structure(
     parallels = begin(partial(_parallels, scene, marks, options))
     meeting = begin(partial(meetings, marks, level, least_line))
     on_line = on_lines(marks, level, least)
-    search = partial(_planes_in, marks, on_line, options, partial(report, "finding planes"))
+    search = partial(_plane_search(marks, on_line, options).planes, progress=partial(report, "finding planes"))
     enough = options.planes.min_support
     planes, point_on_plane, line_on_plane = on_fitted_planes(
         marks, search(), level, (least, least_line), enough, again=search
@@ -196,27 +196,19 @@ def _check(options: StructureOptions) -> None:
         )
 
 
-def _planes_in(
-    marks: Landmarks,
-    on_line: Pairs,
-    options: StructureOptions,
-    progress: Callable[[int, int], None],
-    known: PlaneSet | None = None,
-) -> PlaneSet:
-    """Planes in the usable points and segments."""
+def _plane_search(marks: Landmarks, on_line: Pairs, options: StructureOptions) -> PlaneSearch:
+    """A search for planes in the usable points and segments."""
     points, lines = np.flatnonzero(marks.point_usable), np.flatnonzero(marks.line_usable)
     line_of_point, position = np.full(len(marks.points), -1), np.full(len(marks.segments) + 1, -1)
     line_of_point[on_line.pairs[:, 0]] = on_line.pairs[:, 1]
     position[lines] = np.arange(len(lines))
-    return find_planes(
+    return PlaneSearch(
         marks.points[points],
         marks.point_noise.covariance[points],
         marks.segments[lines],
         marks.line_noise.ends(lines),
         options.planes,
         position[line_of_point[points]],
-        progress,
-        known,
     )
 
 
