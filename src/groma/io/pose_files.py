@@ -97,8 +97,8 @@ def read_poses(path: str | os.PathLike[str], photographs: Sequence[str]) -> Pose
     if begins_with(head, b"{") or begins_with(head, b"["):
         raise FileFormatError(
             f"{place} is a JSON file of a kind that is not read for poses. Read are transforms.json, "
-            "reconstruction.json, sfm_data.json, cameras.sfm and the cameras.json of splats. Else write lines of name x y "
-            "z qx qy qz qw."
+            "reconstruction.json, sfm_data.json, cameras.sfm and the cameras.json of splats; else lines of "
+            "name x y z qx qy qz qw."
         )
     first = b""
     with reading(place, "file of poses"):
