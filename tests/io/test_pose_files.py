@@ -183,3 +183,9 @@ def test_the_calibration_is_of_the_file_or_given_or_a_guess(tmp_path, scene):
     assert len(cameras_of_photographs(images, NAMES, "SIMPLE_RADIAL")[0]) == 2
     with pytest.raises(InputError, match="have the sizes 80x50, 80x60"):
         cameras_of_photographs(images, NAMES, "PINHOLE", (70.0, 71.0, 40.0, 30.0))
+
+
+def test_json_of_another_kind_is_named(tmp_path):
+    (tmp_path / "poses.json").write_text('{"0": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}')
+    with pytest.raises(FileFormatError, match="JSON file of a kind that is not read for poses"):
+        read_poses(tmp_path / "poses.json", ["0.jpg"])

@@ -31,9 +31,10 @@ import numpy as np
 from groma._counted import counted, natural_key
 from groma._image_names import SEVERAL, rows_by_name, tell_partly
 from groma._typing import FloatArray, IntArray
+from groma.bounded.documents import begins_with
 from groma.bounded.names import existing
 from groma.bounded.text import read_lines
-from groma.errors import InputError
+from groma.errors import FileFormatError, InputError
 from groma.geometry import se3
 from groma.io.g2o import looks_like_g2o, read_g2o
 from groma.io.interchange.calibration import camera_table, shared
@@ -93,6 +94,12 @@ def read_poses(path: str | os.PathLike[str], photographs: Sequence[str]) -> Pose
         return _of_model(place, photographs)
     if head.startswith(MAGIC):
         return _of_llff(place, photographs)
+    if begins_with(head, b"{") or begins_with(head, b"["):
+        raise FileFormatError(
+            f"{place} is a JSON file of a kind that is not read for poses. Read are transforms.json, "
+            "reconstruction.json, sfm_data.json, cameras.sfm and the cameras.json of splats; else lines of "
+            "name x y z qx qy qz qw."
+        )
     first = b""
     with reading(place, "file of poses"):
         first = next((line for _, line in read_lines(place)), "").encode()
