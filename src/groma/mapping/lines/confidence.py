@@ -87,9 +87,9 @@ class ConfidenceGates:
     )
     edge_deviation: float = gate(0.9, "1", "of the log contrast of edges of a scene", "derived from stairs and a room")
     stripe_length: tuple[float, float] = gate(
-        (-0.16, 0.62), "1", "the same of the log length over the median of all lines", "derived from stairs"
+        (0.85, 0.62), "1", "median of stripes over that of all lines, and deviation of its log", "derived from stairs"
     )
-    edge_length: tuple[float, float] = gate((0.33, 0.86), "1", "that of edges", "derived from stairs")
+    edge_length: tuple[float, float] = gate((1.39, 0.86), "1", "the same of edges", "derived from stairs")
     edge_px: float = gate(SEGMENTS.edge, "px", "residual of a segment of a right line", "derived from an edge's width")
     usual_contrast: float = gate(30.0, "1", "of segments whose contrast is unknown", "chosen on the scenes of the fit")
 
@@ -134,7 +134,8 @@ def edge_probability(evidence: FloatArray, weights: FloatArray) -> FloatArray:
     usual, spread = gates.edge_contrast
     means = np.linspace(gates.stripe_contrast[0], usual + 3.0 * spread, _MEANS)[:, None]
     ratio = _edge_ratio(contrast, gates.stripe_contrast, means, gates.edge_deviation)
-    ratio = ratio + _edge_ratio(length, gates.stripe_length, *gates.edge_length)
+    (stripe, sigma), (edge, edge_sigma) = gates.stripe_length, gates.edge_length
+    ratio = ratio + _edge_ratio(length, (math.log(stripe), sigma), math.log(edge), edge_sigma)
     odds = _share_odds(ratio, belongs)
     # Log likelihood of the lines over that if all were stripes, and the prior of the mean.
     fit = (belongs * (np.logaddexp(0.0, ratio + odds) - np.logaddexp(0.0, odds))).sum(axis=1, keepdims=True)
