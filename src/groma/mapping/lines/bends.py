@@ -72,4 +72,4 @@ def _bending_ends(scene: Scene, segments: Sequence[Segments]) -> BoolArray:
 
 def _apart(pixel: FloatArray, image: IntArray) -> FloatArray:
     """Places (N, 3) that are near to each other in one image only."""
-    return np.column_stack([pixel, 2.0 * LINE_ENDS.same_end * image])
+    return np.column_stack([pixel, 2.0 * LINE_ENDS.same_end * image.astype(np.float64)])

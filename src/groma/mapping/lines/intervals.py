@@ -70,20 +70,21 @@ def with_supported_intervals(scene: Scene, segments: Sequence[Segments] = ()) ->
     line, found = supported_intervals(seen.line_idx[rows], seen.image_idx[rows], share, size[rows], scene.num_lines)
     low, high = leaves.argmin(axis=1) / GATES.parts, 1.0 - leaves[:, ::-1].argmin(axis=1) / GATES.parts
     found = np.clip(found, low[line, None], high[line, None])  # the noise of ends moves none to where edges leave
-    line, found = (one[found[:, 0] < found[:, 1]] for one in (line, found))
+    some = found[:, 0] < found[:, 1]
+    line, found = line[some], found[some]
     count = np.bincount(line, minlength=scene.num_lines)
     first = np.cumsum(count) - count
     hull = np.tile([0.0, 1.0], (scene.num_lines, 1))
     some = count > 0
     hull[some] = np.column_stack([found[first[some], 0], found[(first + count - 1)[some], 1]])
-    segments, extent = scene.lines.segments, np.diff(scene.lines.segments, axis=1)
-    moved = segments[:, :1] + hull[..., None] * extent
+    before, extent = scene.lines.segments, np.diff(scene.lines.segments, axis=1)
+    moved = before[:, :1] + hull[..., None] * extent
     several = count[line] > 1
     line, found = line[several], found[several]
     low, high = hull[line].T
     found = np.clip((found - low[:, None]) / (high - low)[:, None], 0.0, 1.0)
     return scene.replace(
-        lines=scene.lines.replace(segments=np.where((hull == [0.0, 1.0])[..., None], segments, moved)),
+        lines=scene.lines.replace(segments=np.where((hull == [0.0, 1.0])[..., None], before, moved)),
         line_intervals=LineIntervals(line, found[:, 0], found[:, 1]),
     )
 
