@@ -7,6 +7,7 @@ import pytest
 from groma.errors import InputError
 from groma.estimators.line_intervals import supported_intervals
 from groma.evaluation.lines import evaluate_lines
+from groma.features.segments import Segments
 from groma.io import read_scene, write_scene
 from groma.io.archive import read_archive, write_archive
 from groma.io.limap.structures import read_limap
@@ -142,6 +143,48 @@ def test_where_an_edge_lies_beside_its_line_nothing_is_supported(gapped, images)
     reached = (scene.lines.segments[1] - first) @ (last - first) / ((last - first) @ (last - first))
     np.testing.assert_allclose(reached, [0.0, 1.0 if images == 1 else 0.75], atol=0.06)
     np.testing.assert_allclose(line_pieces(scene)[0][:2, :, 0], [[0, 3], [6, 10]], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("num_bent", "turn", "dark", "reached"),
+    [
+        (2, 0.3, "same", 0.6),  # two show that the edge bends away, two the line
+        (1, 0.3, "same", 1.0),  # outvoted
+        (2, 0.005, "same", 1.0),  # goes on straight
+        (2, 1.2, "same", 1.0),  # no curve: the outline of what hides the edge
+        (2, 0.3, "other", 1.0),  # another edge
+        (0, 0.0, "none", 1.0),  # images without segments
+    ],
+)
+def test_a_line_ends_where_as_many_images_show_its_edge_bending_away(gapped, num_bent, turn, dark, reached):
+    first, last = gapped.lines.segments[1]
+    bend, seen = first + 0.6 * (last - first), gapped.line_observations
+    rows, segment, segments = np.flatnonzero(seen.line_idx == 1), seen.segment.copy(), []
+    for k, center in enumerate(gapped.cam_centers_in_world):
+        found = []
+        if k < num_bent:
+            segment[rows[k]] = seen_from(center, np.array([first, bend]))
+            begin, along = segment[rows[k], 2:], np.diff(segment[rows[k]].reshape(2, 2), axis=0)[0]
+            turned = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ along
+            following = np.concatenate([begin, begin + 40.0 * turned / np.linalg.norm(turned)])
+            found = [following if dark == "same" else np.roll(following, 2)]
+        ends = np.concatenate([segment[seen.image_idx == k], found]) if found else segment[seen.image_idx == k]
+        ends = ends if dark != "none" else ends[:0]
+        segments.append(Segments(ends, np.full(len(ends), 0.3), np.full(len(ends), 20.0)))
+    scene = gapped.replace(line_observations=seen.replace(segment=segment))
+    ended = with_supported_intervals(scene, segments).lines.segments[1]
+    np.testing.assert_allclose(
+        (ended - first) @ (last - first) / ((last - first) @ (last - first)), [0.0, reached], atol=0.05
+    )
+    # The direction of the line does not matter.
+    backwards = scene.replace(lines=Lines.through(scene.lines.segments[:, ::-1]))
+    again = with_supported_intervals(backwards, segments).lines.segments[1, ::-1]
+    np.testing.assert_allclose(again, ended, atol=0.05 * np.linalg.norm(last - first))
+
+
+def test_scenes_without_lines_have_no_bends(gapped):
+    bare, nothing = gapped.keep(lines=[]), [Segments.empty()] * 4
+    assert with_supported_intervals(bare, nothing).num_lines == 0
 
 
 def test_one_line_per_interval(gapped):

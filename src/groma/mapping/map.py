@@ -274,7 +274,9 @@ def map_segments(
     weights = shared()
     scene = scene.replace(point_observations=weights.point_observations, line_observations=weights.line_observations)
     adjusted = stages.run(adjust_everything, scene, weighted)
-    return result_of(points, scene, adjusted, weighted, line_map, options.min_confidence, not options.refine_poses)
+    return result_of(
+        points, scene, adjusted, weighted, line_map, segments, options.min_confidence, not options.refine_poses
+    )
 
 
 # --------------------------------------------------------------------------------------------------------------- stages

@@ -26,6 +26,7 @@ from groma.adjustment.survey.protocol import protocol
 from groma.adjustment.uncertainty import pose_uncertainty
 from groma.bounded.json_text import json_text
 from groma.execution import begin, beside
+from groma.features.segments import Segments
 from groma.io import atomic_output, write_geometry, write_scene
 from groma.mapping.depth.points import MeasuredDepths
 from groma.mapping.lines.confidence import line_confidence
@@ -242,6 +243,7 @@ def result_of(
     adjusted: AdjustResult,
     weighted: AdjustOptions,
     line_map: LineMap,
+    segments: Sequence[Segments],
     min_confidence: float,
     held: bool,
 ) -> MapResult:
@@ -249,7 +251,7 @@ def result_of(
 
     Where poses were held, lines as mapped tell best what their segments say: none has given way to a plane yet.
     """
-    scene = with_supported_intervals(adjusted.scene)
+    scene = with_supported_intervals(adjusted.scene, segments)
     before = before.replace(line_intervals=scene.line_intervals)
     confidence = line_confidence(before if held else scene, weighted.structure_sigma_px)
     scene, kept = scene.replace(lines=scene.lines.replace(confidence=confidence)), confidence >= min_confidence

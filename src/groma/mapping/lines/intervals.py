@@ -8,10 +8,13 @@ displacement across it, the edge lies beside the line at that place, and nothing
 .. math:: b^\top A^{-1} b > n\, w^2 + \chi^2_2\, \sigma^2, \qquad A = \sum_k g_k g_k^\top, \quad b = \sum_k r_k g_k :
 
 where one place in space explains a mean square distance of more than the width w of an edge, beyond usual noise.
+Nothing supports it either where as many images show that the edge has bent away (:mod:`groma.mapping.lines.bends`) as
+show the line.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -20,10 +23,11 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.line_intervals import supported_intervals
 from groma.execution import begin, map_in_threads
-from groma.features.segments import SEGMENTS
+from groma.features.segments import SEGMENTS, Segments
 from groma.gates import gate
 from groma.geometry import segment2
 from groma.geometry.algebra import ratio
+from groma.mapping.lines.bends import num_bent
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.noise.landmarks import LineEndRows, line_end_rows, line_sigma_px
 from groma.scene import LineIntervals, Scene
@@ -45,14 +49,15 @@ _SINGULAR = 1e-9
 _AT_ONCE = 4096
 
 
-def with_supported_intervals(scene: Scene) -> Scene:
+def with_supported_intervals(scene: Scene, segments: Sequence[Segments] = ()) -> Scene:
     """Return the scene with the intervals of its lines found anew; segments end where the outermost intervals do.
 
-    Lines that no two images support anywhere stay as they are.
+    Lines that no two images support anywhere stay as they are. ``segments`` are all those of each image, which tell
+    where edges bend; nothing is known of that without them.
     """
     seen = scene.line_observations
     shares = begin(partial(observed_shares, scene))
-    leaves = _beside_edges(scene)
+    leaves = _beside_edges(scene, segments)
     share, length = shares(), segment2.length(seen.segment)
     size = np.maximum(share[:, 1] - share[:, 0], 1e-12) / np.maximum(length, 1e-12)
     known, bent = np.isfinite(share.sum(axis=1)), np.asarray(leaves.any(axis=1))[seen.line_idx]
@@ -63,24 +68,28 @@ def with_supported_intervals(scene: Scene) -> Scene:
     rows = np.concatenate([whole, cut[np.nonzero(kept)[0]]])
     share = np.concatenate([share[whole], np.column_stack([low[kept], high[kept]])])
     line, found = supported_intervals(seen.line_idx[rows], seen.image_idx[rows], share, size[rows], scene.num_lines)
+    low, high = leaves.argmin(axis=1) / GATES.parts, 1.0 - leaves[:, ::-1].argmin(axis=1) / GATES.parts
+    found = np.clip(found, low[line, None], high[line, None])  # the noise of ends moves none to where edges leave
+    some = found[:, 0] < found[:, 1]
+    line, found = line[some], found[some]
     count = np.bincount(line, minlength=scene.num_lines)
     first = np.cumsum(count) - count
     hull = np.tile([0.0, 1.0], (scene.num_lines, 1))
     some = count > 0
     hull[some] = np.column_stack([found[first[some], 0], found[(first + count - 1)[some], 1]])
-    segments, extent = scene.lines.segments, np.diff(scene.lines.segments, axis=1)
-    moved = segments[:, :1] + hull[..., None] * extent
+    before, extent = scene.lines.segments, np.diff(scene.lines.segments, axis=1)
+    moved = before[:, :1] + hull[..., None] * extent
     several = count[line] > 1
     line, found = line[several], found[several]
     low, high = hull[line].T
     found = np.clip((found - low[:, None]) / (high - low)[:, None], 0.0, 1.0)
     return scene.replace(
-        lines=scene.lines.replace(segments=np.where((hull == [0.0, 1.0])[..., None], segments, moved)),
+        lines=scene.lines.replace(segments=np.where((hull == [0.0, 1.0])[..., None], before, moved)),
         line_intervals=LineIntervals(line, found[:, 0], found[:, 1]),
     )
 
 
-def _beside_edges(scene: Scene) -> BoolArray:
+def _beside_edges(scene: Scene, segments: Sequence[Segments]) -> BoolArray:
     """Tell beside which parts (L, 24) of lines their edges lie."""
     ends, width, size = line_end_rows(scene), SEGMENTS.edge, scene.num_lines * GATES.parts
     lines, starts = scene.line_observations.line_idx, range(0, max(len(ends.share), 1), _AT_ONCE)
@@ -91,7 +100,11 @@ def _beside_edges(scene: Scene) -> BoolArray:
     determinant = xx * yy - xy**2
     explained = ratio(yy * xr**2 - 2.0 * xy * xr * yr + xx * yr**2, determinant, determinant > 0.0, 0.0)
     noise = AGREEMENT.max_squared(2) * line_sigma_px(scene, ends) ** 2
-    return ((explained > width**2 * count + noise) & (leaving >= GATES.min_leaving)).reshape(-1, GATES.parts)
+    beside = ((explained > width**2 * count + noise) & (leaving >= GATES.min_leaving)).reshape(-1, GATES.parts)
+    if not segments or not len(lines):
+        return beside
+    bent, shown = num_bent(scene, segments, ends, GATES.parts), count.reshape(-1, GATES.parts)
+    return beside | ((bent >= shown) & (bent > 0))
 
 
 def _shown_parts(ends: LineEndRows, line_idx: IntArray, rows: slice) -> tuple[FloatArray | IntArray, ...]:

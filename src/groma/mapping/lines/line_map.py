@@ -76,7 +76,7 @@ class LineMap:
             ),
             relations=Relations(point_on_plane=scene.relations.point_on_plane),
         )
-        return with_supported_intervals(lines)
+        return with_supported_intervals(lines, segments)
 
 
 def explain(line_map: LineMap, num_left_out: int = 0, min_confidence: float = 0.0) -> str:
