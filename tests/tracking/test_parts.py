@@ -330,7 +330,7 @@ def test_pose_from_matches_with_outliers():
 def test_stereo_columns():
     left, depth = _room.render(IDENTITY)
     right = _room.render(np.array([0, 0, 0, 1, -_room.BASELINE, 0, 0]))[0]
-    pixel = corners(left, 200, 8)
+    pixel = corners(left, 200, 8.0)
     pixel = pixel[(pixel[:, 0] > 40) & (pixel[:, 0] < 300)]
     row, column = pixel[:, 1].astype(int), pixel[:, 0].astype(int)
     expected = pixel[:, 0] - _room.FOCAL * _room.BASELINE / depth[row, column]
@@ -345,7 +345,7 @@ def test_stereo_columns():
 def test_points_follow_a_shift():
     image = _room.render(IDENTITY)[0]
     moved = np.roll(image, (3, 5), axis=(0, 1))
-    pixel = corners(image, 100, 8)
+    pixel = corners(image, 100, 8.0)
     pixel = pixel[(pixel.min(axis=1) > 20) & (pixel[:, 0] < 290) & (pixel[:, 1] < 210)]
     there, good = follow(image, moved, pixel)
     assert good.mean() > 0.9

@@ -32,20 +32,6 @@ def test_texture_is_followed():
     assert np.quantile(error, 0.95) < 0.5
 
 
-def test_corners_are_the_best_of_each_cell():
-    image = _noisy(_texture(0), 2.0, 1)
-    rating = cv2.cornerMinEigenVal(image, 5)
-    pixels = corners(image, 1000, 32)
-    at = (pixels - 0.5).astype(int)
-    assert len(np.unique(at // 32, axis=0)) == len(at) > 60
-    assert np.all(np.diff(rating[at[:, 1], at[:, 0]]) <= 1e-7)
-    # Those of a cell far from the border, found without the loop.
-    cell = rating[64:96, 96:128] * (rating == cv2.dilate(rating, np.ones((3, 3))))[64:96, 96:128]
-    v, u = np.unravel_index(cell.argmax(), cell.shape)
-    assert [96 + u, 64 + v] in at.tolist()
-    np.testing.assert_array_equal(corners(image, 10, 32), pixels[:10])
-
-
 def test_points_far_from_where_they_are_expected_are_given_up():
     image = _noisy(_texture(0), 2.0, 1)
     pixels = corners(image, 50, 10)

@@ -36,9 +36,8 @@ IMAGES = ImageGates()
 
 def smoothed(image: GrayImage) -> SmoothImage:
     """Return a grey image (H, W) as edges and patches are measured in it, with less noise."""
-    weights = cv2.getGaussianKernel(2 * round(4.0 * IMAGES.blur) + 1, IMAGES.blur, cv2.CV_32F)  # to four deviations
-    smooth = cv2.sepFilter2D(image, cv2.CV_32F, weights, weights, borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(smooth, np.float32)
+    levels = image.astype(np.float32)
+    return np.asarray(cv2.GaussianBlur(levels, (0, 0), IMAGES.blur, borderType=cv2.BORDER_REPLICATE), np.float32)
 
 
 def to_gray(image: npt.NDArray[np.generic]) -> GrayImage:

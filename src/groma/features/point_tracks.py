@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 
-from groma._numba import loop, unrolled_loop
+from groma._numba import loop
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.features.images import MIN_SIDE, GrayImage
+from groma.features.images import GrayImage
 from groma.gates import SEQUENCES, SIGMA_OF_MEDIAN, gate
 
 _HALF = np.float32(0.5)
@@ -40,8 +41,8 @@ class PointTrackGates:
 
     @property
     def noise_eigenvalue(self) -> float:
-        """Mean eigenvalue that noise of one grey level makes."""
-        return 12.0 * self.block**2  # derived from Sobel's weights
+        """Mean eigenvalue that noise of one grey level makes: 12 times the samples, by 4, the width and 255."""
+        return 12.0 * self.block**2 / (4.0 * self.block * 255.0) ** 2  # derived from Sobel's weights
 
 
 #: The numbers in use.
@@ -66,52 +67,6 @@ def _correlate_all(first, second, out):
             ab += x * y
         size = math.sqrt(float(aa * count - a * a) * float(bb * count - b * b))
         out[i] = float(ab * count - a * b) / max(size, 1e-6)
-
-
-@unrolled_loop
-def _best_corners(dx, dy, block, cell, best, place):
-    """Write the largest rating of a local maximum in each cell, and its pixel (row by row).
-
-    A rating is the least eigenvalue of the sums of gradients over a block, as wide as ``block`` is long. Three rows of
-    ratings are kept.
-    """
-    (height, width), size = dx.shape, len(block)
-    sums, ratings, margin = np.zeros((3, width), np.int32), np.zeros((3, width), np.float32), size // 2
-    for i in range(height):
-        rating = ratings[i % 3]
-        for j in range(width):
-            x, y = np.int32(dx[i, j]), np.int32(dy[i, j])
-            sums[0, j] += x * x
-            sums[1, j] += x * y
-            sums[2, j] += y * y
-        if i < size:
-            continue
-        for j in range(width):
-            x, y = np.int32(dx[i - size, j]), np.int32(dy[i - size, j])
-            sums[0, j] -= x * x
-            sums[1, j] -= x * y
-            sums[2, j] -= y * y
-        for j in range(width - size + 1):
-            xx = xy = yy = np.int32(0)
-            for k in range(size):
-                xx += sums[0, j + k]
-                xy += sums[1, j + k]
-                yy += sums[2, j + k]
-            half, cross = np.float32(0.5) * np.float32(xx - yy), np.float32(xy)
-            rating[j] = np.float32(0.5) * np.float32(xx + yy) - np.sqrt(half * half + cross * cross)
-        # The row before is complete, and so are its neighbours.
-        middle, row = ratings[(i - 1) % 3], i - 1 - margin
-        one, two = ratings[(i - 2) % 3], rating
-        for k in range(best.shape[1]):
-            most = best[row // cell, k]
-            for j in range(max(k * cell, margin + 1), min((k + 1) * cell, width - margin - 1)):
-                n = j - margin
-                value = middle[n]
-                if value > most and value >= middle[n + 1] and value >= middle[n - 1]:
-                    if value >= max(one[n - 1], one[n], one[n + 1], two[n - 1], two[n], two[n + 1]):
-                        most = value
-                        place[row // cell, k] = row * width + j
-            best[row // cell, k] = most
 
 
 @loop
@@ -245,20 +200,18 @@ def spread(
     return order[np.sort(np.unique(cells, return_index=True)[1])][:count]
 
 
-def corners(image: GrayImage, count: int, cell: int) -> FloatArray:
-    """Corners (Shi and Tomasi) that noise does not explain, the best of each cell: (N, 2) pixels, strongest first."""
+def corners(image: GrayImage, count: int, distance: float) -> FloatArray:
+    """Corners (Shi and Tomasi) that noise does not explain, (N, 2) pixels, strongest first."""
     gates = POINT_TRACKS
-    height, width = image.shape
-    if min(height, width) < MIN_SIDE:
+    everywhere: Any = None  # missing in OpenCV's types
+    found, strength = cv2.goodFeaturesToTrackWithQuality(
+        image, count, gates.quality, distance, everywhere, blockSize=gates.block
+    )
+    if found is None:
         return np.zeros((0, 2))
-    best = np.zeros((height // cell + 1, width // cell + 1), np.float32)
-    place = np.zeros(best.shape, np.int64)
-    dx, dy = (cv2.Sobel(image, cv2.CV_16S, 1 - axis, axis, ksize=3) for axis in (0, 1))
-    _best_corners(dx, dy, (None,) * gates.block, cell, best, place)
+    at, strength = found.reshape(-1, 2), strength.ravel()
     noise = gates.noise_eigenvalue * image_noise(image) ** 2
-    chosen = best > max(gates.quality * best.max(), gates.above_noise * noise)
-    found = place[chosen][np.argsort(-best[chosen], kind="stable")][:count]
-    return np.column_stack([found % width, found // width]) + 0.5
+    return at[strength > gates.above_noise * noise].astype(np.float64) + 0.5
 
 
 def image_noise(image: GrayImage) -> float:

@@ -150,7 +150,8 @@ class FrameFeatures:
     @_FoundOnce
     def corners(self) -> FloatArray:
         """Corners (N, 2) for tracking, strongest first."""
-        found = corners(self.gray, self.options.num_points, self.corner_cell)
+        distance = self.options.gates.points.corner_distance * self.corner_cell
+        found = corners(self.gray, self.options.num_points, distance)
         return found if self.frame.used is None else found[is_used(self.frame.used, found)]
 
     def lock_of(self, name: str) -> Any:

@@ -27,6 +27,7 @@ class PointGates:
 
     same_feature: float = gate(2.0, "px", "a feature within this distance of a followed point is that point", SEQUENCES)
     few: float = gate(0.33, "share", "with fewer of the wanted points, one camera places features by motion", SEQUENCES)
+    corner_distance: float = gate(0.7, "cells", "distance of new corners", SEQUENCES)
     border: float = gate(8.0, "px", "of new points from the edge of the image", "derived from the patch: 15 px")
     patch_keyframes: int = gate(2, "keyframes", "whose patches are looked for in one frame", "cost: time per frame")
     again_radius: float = gate(6.0, "px", "distance at which a point of the map is found again", SEQUENCES)
