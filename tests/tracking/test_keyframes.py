@@ -14,7 +14,7 @@ from groma.tracking import Tracker, TrackOptions
 from groma.tracking.backend.local_adjustment import window_job
 from groma.tracking.backend.loop_closure import LoopSearch
 from groma.tracking.backend.mapper import Mapper
-from groma.tracking.frame.camera import TrackCamera, into
+from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.features import Features, FrameFeatures, describe
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
 from groma.tracking.map.culling import drop_unseen
@@ -202,21 +202,6 @@ def test_points_that_are_not_found_are_looked_for_ever_more_rarely(monkeypatch):
     assert track_map.points.misses.tolist() == [0, 13, 13]
     drop_unseen(track_map, gates.max_misses)
     assert track_map.points.alive.tolist() == [True, False, False]
-
-
-@pytest.mark.parametrize(("degrees", "asked"), [(15.0, 1), (25.0, 0)])
-def test_points_seen_from_another_side_than_their_patches_are_missed_without_a_look(monkeypatch, degrees, asked):
-    camera, track_map, place = TrackCamera.of(_room.camera()), TrackMap(), np.array([[0.0, 0.0, 2.0]])
-    rows, image = track_map.points.extend(1), np.zeros((camera.height, camera.width), np.uint8)
-    track_map.points.xyz[rows], track_map.points.state[rows], track_map.points.keyframe[rows] = place, ALIVE, 0
-    first = Keyframe(0, 0.0, "0", se3.identity(), image, Measurements.empty(), Features.none(), np.zeros(0))
-    track_map.keyframes.append(first)
-    pose = se3.exp(np.array([[0.0, 0.0, 0.0, 0.0, math.radians(degrees), 0.0]]))[0]
-    pose[4:] = (place - into(pose, place))[0]  # around the point, which stays in the middle of the image
-    monkeypatch.setattr("groma.tracking.map.points.follow", lambda *a, **_: (a[3], np.ones(len(a[3]), dtype=bool)))
-    found = find_again(track_map, camera, image, pose, PointTracks.empty(), 10, OPTIONS.gates.points)
-    assert len(found) == asked
-    assert track_map.points.misses.tolist() == [1 - asked]
 
 
 def test_measurements_of_keyframes_are_stacked_under_the_numbers_of_today():

@@ -31,7 +31,6 @@ class PointGates:
     border: float = gate(8.0, "px", "of new points from the edge of the image", "derived from the patch: 15 px")
     patch_keyframes: int = gate(2, "keyframes", "whose patches are looked for in one frame", "cost: time per frame")
     again_radius: float = gate(6.0, "px", "distance at which a point of the map is found again", SEQUENCES)
-    again_angle: float = gate(0.35, "rad", "between its ray and that of its patch", "chosen on the filing cabinet")
     again_room: float = gate(0.2, "share", "share of the wanted points that must be missing", "cost: time per frame")
     first_of: int = gate(4, "points", "of which one is followed before the others", "cost: time per searched frame")
     min_parallax: float = gate(0.015, "rad", "angle between rays that place a point", SEQUENCES)

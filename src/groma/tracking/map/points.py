@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +11,7 @@ import numpy.typing as npt
 from groma._rows import Rows, column
 from groma._typing import FloatArray, IntArray
 from groma.features.point_tracks import follow
-from groma.geometry.algebra import dot, unit
-from groma.tracking.frame.camera import TrackCamera, back, into
+from groma.tracking.frame.camera import TrackCamera, into
 from groma.tracking.gates import PointGates
 from groma.tracking.map.track_map import TrackMap
 
@@ -76,8 +74,7 @@ def find_again(
 ) -> PointTracks:
     """Look for points of the map that are in view but not followed, by their patches in keyframes.
 
-    What is seen from another side than its patch looks different, and is missed without a look. What is not found is
-    hardly found in the next frame: it is looked for again after 1, 2, 4, ... frames in view.
+    What is not found is hardly found in the next frame: it is looked for again after 1, 2, 4, ... frames in view.
     """
     points = track_map.points
     wanted = points.alive.copy()
@@ -102,8 +99,6 @@ def find_again(
             break
         misses = points.misses[rows[of]]
         due = misses & (misses + 1) == 0
-        rays = [points.xyz[rows[of]] - back(at, np.zeros(3)) for at in (pose, track_map.keyframes[index].pose)]
-        due &= dot(*(unit(each) for each in rays)) > math.cos(gates.again_angle)
         points.misses[rows[of[~due]]] += 1
         of = of[due]
         patch = track_map.keyframes[index].gray
