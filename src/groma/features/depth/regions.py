@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from groma._numba import inline_kernel, kernel, loop
+from groma._numba import inline_kernel, kernel, loop, unrolled_loop
 from groma._ordering import ascending, copy
 from groma.gates import gate
 
@@ -87,7 +87,7 @@ def _bend_allowance(s, t, noise, bend):
     return ratio * ratio
 
 
-@loop
+@unrolled_loop
 def block_sums(depth, pinhole, noise, size, step, sums, counts):
     """Sums (R, C, 10) and numbers (R, C) of the pixels of blocks of ``size`` samples, ``step`` pixels apart."""
     rows, columns = (depth.shape[0] + step - 1) // step, (depth.shape[1] + step - 1) // step

@@ -22,7 +22,6 @@ from groma.geometry import se3
 from groma.scene.landmarks import Lines
 from groma.tracking.frame.camera import TrackCamera, back, into, planes_back, planes_into
 from groma.tracking.frame.descriptor_pairs import pair_anywhere
-from groma.tracking.frame.features import Descriptors, Features
 from groma.tracking.gates import LoopGates, TrackingGates
 from groma.tracking.map.feature_points import match_features
 from groma.tracking.map.landmarks import ALIVE, DEAD
@@ -49,8 +48,8 @@ class LoopSearch:
     def run(self) -> list[tuple[Keyframe, IntArray, IntArray]]:
         """Return the candidates whose descriptions match best, with the rows of the pairs; no access to the map."""
         features, gates, max_bits = self.newest.features, self.gates.loops, self.gates.features.max_bits
-        voters = _strongest(features, gates.voters)
-        others = (_strongest(other.features, gates.voters) for other in self._known)
+        voters = features.strongest(gates.voters)
+        others = (other.features.strongest(gates.voters) for other in self._known)
         votes = np.array([len(pair_anywhere(other, voters, max_bits)[0]) for other in others])
         out = []
         for k in np.argsort(-votes, kind="stable")[: gates.searched]:
@@ -58,11 +57,6 @@ class LoopSearch:
             if len(first) >= gates.min_matches and (self.agrees is None or self.agrees(self._known[k], first, second)):
                 out.append((self.candidates[k], first, second))
         return out
-
-
-def _strongest(features: Features, count: int) -> Descriptors:
-    """Descriptors (count, 32) of the strongest features: what stands out in one image does in another."""
-    return features.descriptor[np.argsort(-features.response, kind="stable")[:count]]
 
 
 def search_for_loop(

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from groma._numba import kernel, loop
+from groma._numba import kernel, loop, unrolled_loop
 from groma._ordering import copy
 from groma._typing import FloatArray
 from groma.estimators.batch_least_squares import solve_damped
@@ -113,7 +113,7 @@ def _compare(before, now, K, turn, outlier, H, gradient):
     return count / (height * width), score
 
 
-@loop
+@unrolled_loop
 def _turn_until_best(before, now, K, limits, steps, best):
     """Improve a rotation by Gauss-Newton; return the correlation of the images at the best one."""
     outlier, min_overlap, converged = limits
@@ -144,23 +144,37 @@ def _turn_until_best(before, now, K, limits, steps, best):
     return best_score
 
 
+@kernel
+def _surroundings(image, x, y, patch):
+    """Write the 5 x 5 surroundings of a place in an image with a margin; return their mean."""
+    i, j = int(y), int(x)
+    fx, fy, mean = x - j, y - i, 0.0
+    for row in range(5):
+        top, bottom = image[i + row], image[i + row + 1]
+        for n in range(5):
+            one, two = (
+                top[j + n] * (1.0 - fx) + top[j + n + 1] * fx,
+                bottom[j + n] * (1.0 - fx) + bottom[j + n + 1] * fx,
+            )
+            patch[5 * row + n] = one * (1.0 - fy) + two * fy
+            mean += patch[5 * row + n] / 25.0
+    return mean
+
+
 @loop
 def _correlate(before, now, first, second, noise, each):
-    """Write the correlation of the 5 x 5 surroundings of places in both images; return that of all together."""
-    height, width = before.shape
-    patch = np.empty((2, 25))
+    """Write the correlation of the surroundings of places in both images; return that of all together.
+
+    Places are of the first pixel of their surroundings.
+    """
+    one, two = np.empty(25), np.empty(25)
     all_aa, all_bb, all_ab = noise, noise, 0.0
     for k in range(first.shape[0]):
-        for n in range(25):
-            du, dv = float(n % 5 - 2), float(n // 5 - 2)
-            u, v = min(max(first[k, 0] + du, 0.0), width - 1.0), min(max(first[k, 1] + dv, 0.0), height - 1.0)
-            patch[0, n] = _grey(before, u, v)
-            u, v = min(max(second[k, 0] + du, 0.0), width - 1.0), min(max(second[k, 1] + dv, 0.0), height - 1.0)
-            patch[1, n] = _grey(now, u, v)
-        mean_a, mean_b = patch[0].mean(), patch[1].mean()
+        mean_a = _surroundings(before, first[k, 0], first[k, 1], one)
+        mean_b = _surroundings(now, second[k, 0], second[k, 1], two)
         aa, bb, ab = 0.0, 0.0, 0.0
         for n in range(25):
-            a, b = patch[0, n] - mean_a, patch[1, n] - mean_b
+            a, b = one[n] - mean_a, two[n] - mean_b
             aa, bb, ab = aa + a * a, bb + b * b, ab + a * b
         each[k] = ab / math.sqrt((aa + noise) * (bb + noise))
         all_aa, all_bb, all_ab = all_aa + aa, all_bb + bb, all_ab + ab
@@ -249,7 +263,10 @@ def surroundings_agree(
         return -1.0, -1.0
     scale = np.array([width / shape[1], height / shape[0]])
     each, noise = np.zeros(int(inside.sum())), IMAGES.noise**2
-    together = _correlate(before, now, pixels[inside] * scale - 0.5, guesses[inside] * scale - 0.5, noise, each)
+    # Beyond the image its border goes on.
+    wide = [cv2.copyMakeBorder(image, *(4,) * 4, cv2.BORDER_REPLICATE) for image in (before, now)]
+    begins = (places[inside] * scale + 1.5 for places in (pixels, guesses))  # 4 - 2 - 0.5
+    together = _correlate(*wide, *begins, noise, each)
     return float(np.median(each)), float(together)
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from groma._numba import kernel, loop
+from groma._numba import kernel, loop, unrolled_loop
 from groma._rows import pointers_of
 from groma._typing import FloatArray, IntArray
 
@@ -66,11 +66,11 @@ def _best_near(expected, first, pixel, second, order, begin, columns, cell, radi
                         partner[one], bits[one], distance[one] = other, differ, apart
 
 
-@loop
+@unrolled_loop
 def _best_anywhere(words, second, max_bits, partner, bits):
     """Write for each of first (its ``words`` in columns) the nearest of second, or -1 if that has a nearer one.
 
-    All bits of a row are counted before any are compared: so the compiler counts those of several at once.
+    All bits of a row are counted before any are compared, and without branches: so the compiler takes several at once.
     """
     count = words.shape[1]
     one, two, three, four = words[0], words[1], words[2], words[3]
@@ -79,17 +79,16 @@ def _best_anywhere(words, second, max_bits, partner, bits):
         a, b, c, d = second[i, 0], second[i, 1], second[i, 2], second[i, 3]
         least = np.int64(max_bits + 1)
         for j in range(count):
-            differ[j] = (
-                _count_bits(one[j] ^ a) + _count_bits(two[j] ^ b) + _count_bits(three[j] ^ c) + _count_bits(four[j] ^ d)
-            )
-            least = min(least, differ[j])
+            n = _count_bits(one[j] ^ a) + _count_bits(two[j] ^ b) + _count_bits(three[j] ^ c) + _count_bits(four[j] ^ d)
+            differ[j], least = n, min(least, n)
         if least > max_bits:
             continue
         for j in range(count):
-            if differ[j] < bits[j]:
-                partner[j], bits[j] = i, differ[j]
-            if nearest[i] < 0 and differ[j] == least:
-                nearest[i] = j
+            nearer = differ[j] < bits[j]
+            partner[j], bits[j] = i if nearer else partner[j], differ[j] if nearer else bits[j]
+        nearest[i] = 0
+        while differ[nearest[i]] != least:
+            nearest[i] += 1
     for j in range(count):
         if partner[j] >= 0 and nearest[partner[j]] != j:
             partner[j] = -1

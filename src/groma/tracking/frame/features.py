@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from threading import RLock
 from typing import Any, Generic, TypeVar, overload
 
@@ -90,6 +90,14 @@ class Features:
         """Return no features."""
         none = np.zeros(0)
         return cls(np.zeros((0, 2)), none, none, np.zeros((0, 32), np.uint8), none, np.zeros(0, np.int64))
+
+    @cached_property
+    def _by_response(self) -> IntArray:
+        return np.argsort(-self.response, kind="stable")
+
+    def strongest(self, count: int) -> Descriptors:
+        """Descriptors (count, 32) of the strongest features: what stands out in one image does in another."""
+        return self.descriptor[self._by_response[:count]]
 
     def linked(self, rows: IntArray, points: IntArray) -> Features:
         """Return the features, some of them linked to points of the map."""

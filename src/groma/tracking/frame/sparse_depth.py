@@ -22,7 +22,7 @@ def fill_sparse(depth: DepthImage, max_depth: float, gates: TrackingGates = DEFA
     """Return the depth image with holes filled where samples around them lie on a plane; dense images as they are."""
     sparse, cell, window = gates.sparse_depth, gates.sparse_depth.cell, gates.sparse_depth.window
     known = (depth > 0) & (depth <= max_depth)
-    if known.mean() >= sparse.dense or min(depth.shape) < cell * window:
+    if np.count_nonzero(known) >= sparse.dense * known.size or min(depth.shape) < cell * window:
         return depth
     rows, columns = (size // cell for size in depth.shape)
     rho = np.zeros((rows * cell, columns * cell))

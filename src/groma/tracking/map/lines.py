@@ -173,7 +173,8 @@ def assign(
 def _described(ends: FloatArray, inverse: FloatArray | None) -> FloatArray:
     """Rows of :func:`_score_all`."""
     known = np.full(len(ends), np.nan) if inverse is None else inverse
-    return np.column_stack([ends, segment2.direction(ends), segment2.length(ends), known])
+    way, length = ends[:, 2:] - ends[:, :2], segment2.length(ends)
+    return np.column_stack([ends, way / np.maximum(length, 1e-9)[:, None], length, known])
 
 
 def line_ends(

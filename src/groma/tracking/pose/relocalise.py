@@ -20,12 +20,11 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.features.segments import SEGMENTS
 from groma.gates import NORMAL
-from groma.geometry import se3
 from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import Straight, propose
 from groma.localization.pose.matches import Matches
 from groma.tracking.beside import beside
-from groma.tracking.frame.camera import TrackCamera, back, into
+from groma.tracking.frame.camera import TrackCamera, apart, back, into
 from groma.tracking.frame.descriptor_pairs import PlacedFeatures, pair_anywhere, pair_near
 from groma.tracking.frame.features import Descriptors, FrameFeatures
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
@@ -280,13 +279,8 @@ class PoseSearch:
 
     def _is_known(self, start: FloatArray) -> bool:
         """Whether a start is as good as at a pose that was tried."""
-        if not self._tried:
-            return False
-        tried = np.array(self._tried)
-        apart = np.abs(se3.log(se3.compose(np.tile(start, (len(tried), 1)), se3.inverse(tried))))
-        depth = self.track_map.near.depth
-        same = apart[:, :3].max(axis=1) < self.gates.same_shift * depth
-        return bool((same & (apart[:, 3:].max(axis=1) < self.gates.same_turn)).any())
+        shift, turn = self.gates.same_shift * self.track_map.near.depth, self.gates.same_turn
+        return any(way < shift and angle < turn for way, angle in (apart(start, one) for one in self._tried))
 
     def refine(self, start: FloatArray) -> Found | None:
         """Estimate the pose from all that agrees with a start, with narrowing gates."""
