@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from groma._rows import numbered
 from groma._trees import kd_tree
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.line_ends import LINE_ENDS
+from groma.execution import map_in_threads
 from groma.features.segments import SEGMENTS, Segments
 from groma.gates import gate
 from groma.geometry import segment2
@@ -55,19 +57,23 @@ def num_bent(scene: Scene, segments: Sequence[Segments], ends: LineEndRows, part
 
 def _bending_ends(scene: Scene, segments: Sequence[Segments]) -> BoolArray:
     """Return whether the edge that a segment shows of its line leaves it beyond its first and second end, (N, 2)."""
-    seen, every = scene.line_observations, Segments.joined(segments).ends
-    image, found = numbered(np.array([len(one) for one in segments]))[0], np.zeros((len(seen), 2), np.bool_)
-    for end in (0, 1):
-        here = _apart(seen.segment[:, 2 * end : 2 * end + 2], seen.image_idx)
-        there = _apart(every[:, 2 - 2 * end : 4 - 2 * end], image)
-        near = kd_tree(here).sparse_distance_matrix(kd_tree(there), LINE_ENDS.same_end, output_type="coo_matrix")
-        row, following = near.row.astype(np.intp), near.col.astype(np.intp)
-        chain = LineObservations(image[following], seen.line_idx[row], every[following])
-        away = np.abs(line_end_rows(scene.replace(line_observations=chain, line_depths=LineDepths())).residual)
-        begin, goes = away[:, 1 - end], away[:, end]
-        leaves = (begin < SEGMENTS.on) & (goes > begin + SEGMENTS.edge)
-        found[row[leaves & (goes < np.sin(GATES.angle) * segment2.length(chain.segment))], end] = True
-    return found
+    every, image = Segments.joined(segments).ends, numbered(np.array([len(one) for one in segments]))[0]
+    return np.column_stack(map_in_threads(partial(_bends, scene, every, image), (0, 1)))
+
+
+def _bends(scene: Scene, every: FloatArray, image: IntArray, end: int) -> BoolArray:
+    """Return which segments (N,) of lines have one of all (M, 4) behind this end that leaves the line."""
+    seen = scene.line_observations
+    here = _apart(seen.segment[:, 2 * end : 2 * end + 2], seen.image_idx)
+    there = _apart(every[:, 2 - 2 * end : 4 - 2 * end], image)
+    near = kd_tree(here).sparse_distance_matrix(kd_tree(there), LINE_ENDS.same_end, output_type="coo_matrix")
+    row, following = near.row.astype(np.intp), near.col.astype(np.intp)
+    chain = LineObservations(image[following], seen.line_idx[row], every[following])
+    away = np.abs(line_end_rows(scene.replace(line_observations=chain, line_depths=LineDepths())).residual)
+    begin, goes = away[:, 1 - end], away[:, end]
+    leaves = (begin < SEGMENTS.on) & (goes > begin + SEGMENTS.edge)
+    leaves &= goes < np.sin(GATES.angle) * segment2.length(chain.segment)
+    return np.bincount(row[leaves], minlength=len(seen)) > 0
 
 
 def _apart(pixel: FloatArray, image: IntArray) -> FloatArray:
