@@ -81,7 +81,7 @@ ROOMS: Rooms = (
             "groma.estimators.line_triangulation": None,
             "groma.estimators.directions": None,
             "groma.estimators.plane_fit": None,
-            "groma.estimators.plane_search": ("PlaneOptions", "PlaneSet", "find_planes"),
+            "groma.estimators.plane_search": ("PlaneOptions", "PlaneSearch", "PlaneSet", "find_planes"),
             "groma.estimators.motion.matches": ("LandmarkMatches",),
             "groma.estimators.motion.estimation": ("Motion", "MotionOptions", "estimate_motion"),
         },

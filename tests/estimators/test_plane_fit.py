@@ -12,7 +12,7 @@ from groma.estimators import plane_search
 from groma.estimators._plane_candidates import features_of, from_planes
 from groma.estimators.association import inlier_probability
 from groma.estimators.plane_fit import fit_plane, tilt_sigma
-from groma.estimators.plane_search import PlaneOptions, PlaneSearch
+from groma.estimators.plane_search import PlaneOptions, PlaneSearch, find_planes
 from groma.execution import work_with
 
 SIGMA = 0.01
@@ -26,10 +26,6 @@ def wall(rng, count, normal_axis, offset, size=4.0, shift=(0.0, 0.0)):
 
 def noise_of(points):
     return np.broadcast_to(SIGMA**2 * np.eye(3), (len(points), 3, 3))
-
-
-def find_planes(points, *given, **named):
-    return PlaneSearch(points, *given, **named).planes()
 
 
 @pytest.mark.kernels
@@ -92,7 +88,7 @@ def test_others_are_found_beside_planes_that_are_known():
     points = np.concatenate([wall(rng, 300, 0, 0.0), wall(rng, 300, 1, 0.0), wall(rng, 200, 2, 0.0)])
     found = find_planes(points, noise_of(points))
     known = found.take(np.array([1]), np.array([-1, 0, -1]))
-    again = PlaneSearch(points, noise_of(points)).planes(known)
+    again = find_planes(points, noise_of(points), known=known)
     assert len(found) == len(again) == 3
     np.testing.assert_array_equal(again.planes[0], found.planes[1])
     assert (again.point_label == 0)[known.point_label == 0].all()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What counts as a plane: the options of :func:`groma.estimators.plane_search.PlaneSearch`."""
+"""What counts as a plane: the options of :func:`groma.estimators.plane_search.find_planes`."""
 
 from dataclasses import dataclass
 

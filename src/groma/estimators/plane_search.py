@@ -249,6 +249,29 @@ class PlaneSearch:
         filled[features.given] = labels
 
 
+def find_planes(
+    points: FloatArray,
+    covariances: FloatArray,
+    segments: FloatArray | None = None,
+    segment_covariances: FloatArray | None = None,
+    options: PlaneOptions | None = None,
+    carriers: IntArray | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    known: PlaneSet | None = None,
+) -> PlaneSet:
+    """Find planes in points and segments: what a :class:`PlaneSearch` of them finds when it is asked once.
+
+    See there for the parameters, and :meth:`PlaneSearch.planes` for ``progress``, ``known`` and what is returned.
+
+    Raises
+    ------
+    ShapeError, InputError
+        If shapes do not fit or numbers are not finite.
+    """
+    search = PlaneSearch(points, covariances, segments, segment_covariances, options, carriers)
+    return search.planes(known, progress)
+
+
 def _beside(features: Features, some: BoolArray) -> BoolArray:
     """(N,) features that have one of some (N,) among their neighbours."""
     return np.asarray(some[features.neighbours].any(axis=1))
@@ -333,4 +356,4 @@ class _Queue:
             heappush(self._queue, (-float(score[k]), int(which[k])))
 
 
-__all__ = ["BAND", "PlaneOptions", "PlaneSearch", "PlaneSet", "connected_to"]
+__all__ = ["BAND", "PlaneOptions", "PlaneSearch", "PlaneSet", "connected_to", "find_planes"]

@@ -264,7 +264,7 @@ def surroundings_agree(
     scale = np.array([width / shape[1], height / shape[0]])
     each, noise = np.zeros(int(inside.sum())), IMAGES.noise**2
     # Beyond the image its border goes on.
-    wide = [cv2.copyMakeBorder(image, *(4,) * 4, cv2.BORDER_REPLICATE) for image in (before, now)]
+    wide = [cv2.copyMakeBorder(image, 4, 4, 4, 4, cv2.BORDER_REPLICATE) for image in (before, now)]
     begins = (places[inside] * scale + 1.5 for places in (pixels, guesses))  # 4 - 2 - 0.5
     together = _correlate(*wide, *begins, noise, each)
     return float(np.median(each)), float(together)
