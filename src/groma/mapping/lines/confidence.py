@@ -5,7 +5,7 @@ A line is called right where an edge of the object runs along it, at least along
 the usual distance of lines from their cameras. Four things must be true of it:
 
 .. math:: p = \frac{1}{1 + \exp(-w_0 - \sum_k w_k x_k - b)}\;
-          E\Bigl[\frac{1}{1 + \exp(-z(x_t, \mu) - c)}\Bigr]\;
+          E\Bigl[\frac{1}{1 + \exp(-z(x_t, x_l, \mu) - c)}\Bigr]\;
           \bigl(2 F_4(\tau / u) - 1\bigr)\; \operatorname{erf}\frac{1}{\sqrt 2\, r}.
 
 The first factor, that its segments belong together, is a logistic model of five quantities (:func:`line_evidence`). The
@@ -17,16 +17,17 @@ no texture, is told by contrast (:mod:`groma.features.contrast`), since texture 
 it. Where views agree on texture, as they do on stripes of a wall, only this factor tells: stripes are found at the same
 place by any photographs. The logarithm of the contrast :math:`x_t` of stripes is normal with a mean and a deviation
 that texture has anywhere, as it is divided by its own surroundings; z is the logarithm of the likelihood ratio of edges
-to stripes. How far edges stand out is a matter of the scene: much on plain walls, little between rough stones. So the
-mean :math:`\mu` of edges is one of the scene, with a wide prior, and E the mean over what its lines say of it. Long
-lines among others, such as flights of steps, are edges though little contrast is left between them: stripes are short.
-The share of lines that are none, of log odds c, is estimated like the other. The third is the probability of an error
-within :math:`\tau = 0.0025`, where u is the standard deviation across the line that half of its places do not exceed,
-over the usual distance, and F the Student distribution of four degrees of freedom: errors have heavy tails, since what
-edges beside it displace is displaced in all images alike. Segments and the planes that the line lies on tell u
-together: of an edge that all images see from one height, planes know the depth. The fourth is the share of normal
-residuals of r pixels root mean square within the width of an edge, a pixel: chords of curves fit no single line, and
-where segments of a curve are bowed their standard deviations, and with them r, say so.
+to stripes, by contrast and by length. How far edges stand out is a matter of the scene: much on plain walls, little
+between rough stones. So the mean :math:`\mu` of edges is one of the scene, with a wide prior, and E the mean over what
+its lines say of it. The length :math:`x_l` is relative to the others of the scene: stripes are short, and of a flight
+of steps it tells the edges, between which little contrast is left. The share of lines that are none, of log odds c, is
+estimated like the other. The third is the probability of an error within :math:`\tau = 0.0025`, where u is the standard
+deviation across the line that half of its places do not exceed, over the usual distance, and F the Student distribution
+of four degrees of freedom: errors have heavy tails, since what edges beside it displace is displaced in all images
+alike. Segments and the planes that the line lies on tell u together: of an edge that all images see from one height,
+planes know the depth. The fourth is the share of normal residuals of r pixels root mean square within the width of an
+edge, a pixel: chords of curves fit no single line, and where segments of a curve are bowed their standard deviations,
+and with them r, say so.
 
 No quantity depends on the unit of length or on how many pixels an image has. The weights were fitted on rendered scenes
 of boxes and round bodies whose edges are known exactly, and the probabilities compared with those of other scenes
